@@ -535,6 +535,39 @@ def corner_errors(count: int) -> Figures:
     return out
 
 
+def held(count: int) -> Figures:
+    """Return the NEES of poses while a chaser holds 1 m before a face, off by 1 mm and 0.1 degrees
+    RMS over half a second, and 45 times the variance of the mean of 45 whitened errors (3 s): 1 if
+    they are white and as large as stated.
+    """
+    out: Figures = {}
+    for target in ("servicer", "paper"):
+        views, rng, images = Views(target, 960, 540), np.random.default_rng(6), 45
+        perception = views.perception()
+        squares, means = [], []
+        for _ in range(count):
+            roll = rng.uniform(-0.02, 0.02)
+            moved = np.zeros(6)
+            errors = []
+            for _ in range(images):
+                moved += -0.13 * moved + 0.5 * rng.normal(size=6)
+                turn = rotations.exp(np.radians(0.1) * moved[3:] + [0.0, 0.0, roll])
+                place = 1e-3 * moved[:3] + [0.0, 0.0, 1.0]
+                view = views.view(place, rotations.multiply(turn, FACING), np.array([0.2, 0.3, -1]))
+                for s in perception.estimate(view.image).solutions[:1]:
+                    error = pose_error(view.position, view.q, s.position_irf_m, s.q_irf_trf_wxyz)
+                    errors.append(np.linalg.solve(np.linalg.cholesky(s.covariance), error))
+            squares += np.sum(np.square(errors), axis=1).tolist()
+            means.append(np.mean(errors, axis=0))
+        out |= {
+            f"held_{target}_nees_mean": float(np.mean(squares)),
+            f"held_{target}_mean_of_{images}_variance_ratio": float(
+                images * np.mean(np.square(means))
+            ),
+        }
+    return out
+
+
 COUNTS: dict[str, tuple[Callable[[int], Figures], int, int]] = {
     "rendering": (rendering, 200, 20),
     "speed": (speed, 200, 30),
@@ -545,6 +578,7 @@ COUNTS: dict[str, tuple[Callable[[int], Figures], int, int]] = {
     "far": (far, 80, 4),
     "small": (small, 200, 10),
     "corners": (corner_errors, 200, 4),
+    "held": (held, 20, 1),
     "bearing": (bearing, 80, 8),
 }
 """Number of views of each part, and number with ``--quick``."""

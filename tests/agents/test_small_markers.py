@@ -143,7 +143,7 @@ def test_one_far_marker_always_lists_its_true_pose():
 
 @pytest.mark.slow
 def test_covariance_is_consistent_for_small_and_large_markers():
-    """Small ones are far more accurate in a good light than in a bad one."""
+    """Sixty views of a kind, so that the mean of one scatters by a tenth and more."""
     means = []
     for name, near_m, far_m in (
         ("servicer", 0.5, 1.5), ("servicer", 2.5, 4.0), ("servicer", 4.0, 5.5),
@@ -155,8 +155,8 @@ def test_covariance_is_consistent_for_small_and_large_markers():
             if solutions:
                 squares.append(nees_of(solutions, position, q))
         means.append(np.mean(squares))
-        assert means[-1] < 15.0
-    assert 3.0 < np.mean(means) < 7.5, means
+        assert 3.0 < means[-1] < 10.0
+    assert 4.5 < np.mean(means) < 7.5, means
 
 
 def test_corners_that_cannot_be_fitted_are_kept_with_the_error_of_a_contour():

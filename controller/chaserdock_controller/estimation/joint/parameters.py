@@ -58,7 +58,7 @@ class SightingNoise(NamedTuple):
     """
 
 
-SINGLE_MARKER = SightingNoise(white_ratio=1.1, view_ratio=0.2, view_time_s=25.0)
+SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.3, view_time_s=25.0)
 SEVERAL_MARKERS = SightingNoise(white_ratio=1.0, view_ratio=0.25, view_time_s=3.0)
 """Sightings of several markers, whose errors differ: those of the view are averaged."""
 SHAPE = SightingNoise(white_ratio=1.0, view_ratio=1.6, view_time_s=30.0, units_time_s=15.0)

@@ -12,6 +12,7 @@ from argparse import ArgumentParser
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -22,8 +23,9 @@ from chaserdock_agents.chaser.perception import (
     PerceptionResult,
     make_perception,
 )
-from chaserdock_agents.chaser.perception.corners import SETTINGS
+from chaserdock_agents.chaser.perception.corners import SETTINGS, mean_side_px
 from chaserdock_agents.chaser.perception.detect import dictionary_of
+from chaserdock_agents.chaser.perception.pnp import MarkerTable
 from chaserdock_agents.chaser.sighting import decode_image, look
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -96,8 +98,21 @@ class Views:
         facing = (normals * corners.mean(axis=1)).sum(axis=1) < 0.0
         return int((inside.all(axis=(1, 2)) & facing).sum())
 
+    def right_ids(self, detector: cv2.aruco.ArucoDetector, view: View) -> int:
+        """Return how many markers a detector finds, to 5 px, where they are."""
+        right = set[int]()
+        found, ids, _ = detector.detectMarkers(view.image)
+        for px, number in zip(found, [] if ids is None else ids.ravel().tolist(), strict=True):
+            marker = self.model.marker(int(number))
+            if marker is None:
+                continue
+            at = rotations.rotate(view.q, marker.corners_trf_m()) + view.position
+            if np.abs(self.camera.project(at) - px[0]).max() < 5.0:
+                right.add(marker.id)
+        return len(right)
+
     def perception(self, method: Method = "default") -> Perception:
-        return Perception(self.camera, self.model, method, small_markers=True)
+        return Perception(self.camera, self.model, method)
 
     def random_views(self, count: int, near_m: float, far_m: float, seed: int) -> Iterator[View]:
         """Yield views at random attitudes, the centre in the middle 40 % of width and height, the
@@ -424,9 +439,18 @@ def bearing(count: int) -> Figures:
     return out
 
 
+def best_detector(dictionary: cv2.aruco.Dictionary) -> cv2.aruco.ArucoDetector:
+    """Return OpenCV's detector with the settings that find most markers in these views."""
+    best = cv2.aruco.DetectorParameters()
+    best.adaptiveThreshWinSizeStep, best.minMarkerPerimeterRate = 4, 0.01
+    best.minMarkerDistanceRate = 0.05
+    return cv2.aruco.ArucoDetector(dictionary, best)
+
+
 def small(count: int) -> Figures:
     """Return NEES (of two poses the nearer) and number of markers, beside those that OpenCV's
-    detector finds with its defaults, in random views by range.
+    detector finds at the right place with its defaults and with its best settings, in random views
+    by range.
     """
     out: Figures = {}
     for target, near_m, far_m in (
@@ -434,14 +458,20 @@ def small(count: int) -> Figures:
         ("paper", 0.5, 1.5), ("paper", 1.5, 3.0),
     ):  # fmt: skip
         views, squares = Views(target, 640, 480), []
-        perception, ours, theirs, fewer, missed = views.perception(), 0, 0, 0, 0
-        detector = cv2.aruco.ArucoDetector(dictionary_of(views.model.dictionary))
+        perception, ours, missed = views.perception(), 0, 0
+        dictionary = dictionary_of(views.model.dictionary)
+        detectors = {
+            "opencv": cv2.aruco.ArucoDetector(dictionary),
+            "opencv_best": best_detector(dictionary),
+        }
+        theirs, fewer = dict.fromkeys(detectors, 0), dict.fromkeys(detectors, 0)
         for view in views.random_views(count, near_m, far_m, 3):
-            sighting, ids = perception.estimate(view.image), detector.detectMarkers(view.image)[1]
-            right = 0 if ids is None else len(set(ids.ravel().tolist()))
+            sighting = perception.estimate(view.image)
             used = len(sighting.marker_ids)
-            ours, theirs, fewer = ours + used, theirs + right, fewer + (used < right)
-            missed += not sighting.solutions
+            ours, missed = ours + used, missed + (not sighting.solutions)
+            for name, detector in detectors.items():
+                right = views.right_ids(detector, view)
+                theirs[name], fewer[name] = theirs[name] + right, fewer[name] + (used < right)
             each = [
                 (
                     pose_error(view.position, view.q, s.position_irf_m, s.q_irf_trf_wxyz),
@@ -456,8 +486,84 @@ def small(count: int) -> Figures:
             f"{at}nees_mean": float(np.mean(squares)),
             f"{at}without_a_pose": missed,
             f"{at}markers": ours,
-            f"{at}markers_by_opencv": theirs,
-            f"{at}views_with_fewer": fewer,
+        }
+        for name in detectors:
+            out |= {
+                f"{at}markers_by_{name}": theirs[name],
+                f"{at}views_with_fewer_than_{name}": fewer[name],
+            }
+    return out
+
+
+def corner_errors(count: int) -> Figures:
+    """Return errors of fitted corners beside the stated ones, by the narrowest cell of a marker:
+    root mean square, per coordinate; mean and median square of whitened errors (1 and 0.45).
+    """
+    out: Figures = {}
+    for target in ("servicer", "paper"):
+        views = Views(target, 960, 540)
+        perception, table = views.perception(), MarkerTable.of(views.model)
+        found: list[tuple[float, Array, Array, Array]] = []
+        for view in views.random_views(count, 0.4, 4.5, 5):
+            truth = views.camera.project_ideal(
+                rotations.rotate(view.q, table.corners) + view.position
+            )
+            rows = np.flatnonzero(np.isin(table.ids, perception.estimate(view.image).marker_ids))
+            refined = perception.refined(view.image, truth[rows], rows)
+            for k in np.flatnonzero(refined.good).tolist():
+                white = refined.errors.whitening[k]
+                off = (refined.corners_px[k] - truth[rows[k]]).ravel()
+                area_px = float(cv2.contourArea(truth[rows[k]].astype(np.float32)))
+                cell_px = (
+                    area_px / mean_side_px(truth[rows[k : k + 1]])[0] / perception.reader.cells
+                )
+                found.append((cell_px, off, white @ off, np.linalg.inv(white.T @ white)))
+        for low_px, high_px in pairwise((1.0, 2.0, 3.0, 5.0, 10.0, 100.0)):
+            part = [f for f in found if low_px <= f[0] < high_px]
+            if not part:
+                continue
+            squares = np.square([white for _, _, white, _ in part])
+            stated = np.trace(np.array([c for *_, c in part]), axis1=1, axis2=2) / 8.0
+            at = f"corners_{target}_cells_of_{low_px:g}_to_{high_px:g}_px_"
+            out |= {
+                f"{at}markers": len(part),
+                f"{at}rms_px": float(np.sqrt(np.mean(np.square([off for _, off, *_ in part])))),
+                f"{at}stated_median_px": float(np.sqrt(np.median(stated))),
+                f"{at}whitened_square_mean": float(np.mean(squares)),
+                f"{at}whitened_square_median": float(np.median(squares)),
+            }
+    return out
+
+
+def held(count: int) -> Figures:
+    """Return the NEES of poses while a chaser holds 1 m before a face, off by 1 mm and 0.1 degrees
+    RMS over half a second, and 45 times the variance of the mean of 45 whitened errors (3 s): 1 if
+    they are white and as large as stated.
+    """
+    out: Figures = {}
+    for target in ("servicer", "paper"):
+        views, rng, images = Views(target, 960, 540), np.random.default_rng(6), 45
+        perception = views.perception()
+        squares, means = [], []
+        for _ in range(count):
+            roll = rng.uniform(-0.02, 0.02)
+            moved = np.zeros(6)
+            errors = []
+            for _ in range(images):
+                moved += -0.13 * moved + 0.5 * rng.normal(size=6)
+                turn = rotations.exp(np.radians(0.1) * moved[3:] + [0.0, 0.0, roll])
+                place = 1e-3 * moved[:3] + [0.0, 0.0, 1.0]
+                view = views.view(place, rotations.multiply(turn, FACING), np.array([0.2, 0.3, -1]))
+                for s in perception.estimate(view.image).solutions[:1]:
+                    error = pose_error(view.position, view.q, s.position_irf_m, s.q_irf_trf_wxyz)
+                    errors.append(np.linalg.solve(np.linalg.cholesky(s.covariance), error))
+            squares += np.sum(np.square(errors), axis=1).tolist()
+            means.append(np.mean(errors, axis=0))
+        out |= {
+            f"held_{target}_nees_mean": float(np.mean(squares)),
+            f"held_{target}_mean_of_{images}_variance_ratio": float(
+                images * np.mean(np.square(means))
+            ),
         }
     return out
 
@@ -471,6 +577,8 @@ COUNTS: dict[str, tuple[Callable[[int], Figures], int, int]] = {
     "accuracy": (accuracy, 10_000, 60),
     "far": (far, 80, 4),
     "small": (small, 200, 10),
+    "corners": (corner_errors, 200, 4),
+    "held": (held, 20, 1),
     "bearing": (bearing, 80, 8),
 }
 """Number of views of each part, and number with ``--quick``."""

@@ -54,13 +54,13 @@ def subjects_of(
         if perception not in (None, *get_args(Method)) or not target.markers:
             raise TrackError("a TargetModel is tracked by its markers; give a file for a shape")
         name = perception or "default"
-        return (Subject(target.name, target, Perception(camera, target, _method(name), True)),)
+        return (Subject(target.name, target, Perception(camera, target, _method(name))),)
     if isinstance(target, Mapping):
         if not target:
             raise TrackError("no markers given; give {id: side in m}")
         method = _method(perception or "default")
         models = [marker_target(i, side, dictionary, margin_m) for i, side in target.items()]
-        return tuple(Subject(m.name, m, Perception(camera, m, method, True)) for m in models)
+        return tuple(Subject(m.name, m, Perception(camera, m, method)) for m in models)
     known = find_flight_target(str(target), mesh_scale)
     model = known.shape()
     name = perception or ("default" if model.markers else "model")

@@ -98,10 +98,11 @@ def test_markers_are_where_projection_says_and_poses_as_good_as_stated(camera, p
         error, covariance = error_of(found.solutions, position, q)
         nees.append(error @ np.linalg.solve(covariance, error))
         far.append(np.linalg.norm(error[:3]))
-    # A plain camera of 285 px: median 0.016 px, poses 0.1 mm; NEES 3.
+    # A plain camera of 285 px: median 0.016 px, poses 0.1 mm; NEES 5. Mild distortion is drawn by
+    # resampling the image, which moves edges by 0.01 px more.
     assert np.median(np.abs(corner_errors)) < 0.04
     assert np.median(far) < 0.8e-3
-    assert 0.3 < np.median(nees) < 7.0
+    assert 1.0 < np.median(nees) < 12.0
 
 
 def largest_shape(image):
@@ -160,21 +161,35 @@ def test_frames_keep_corners_and_have_the_scale_of_the_image(camera):
 
 
 def test_corners_are_as_uncertain_as_the_lens_stretches_them():
+    """Whitened errors of corners, in ideal pixels, near the border of a fisheye's image."""
     camera = LENSES["fisheye"]
     renderer = Renderer(camera, MODEL, None, Effects().point_spread_px)
-    perception, table = Perception(camera, MODEL), MarkerTable.of(MODEL)
-    position, q, light = next(views(camera, 1, 0.65, 0.7))
-    position = 0.5 * position  # large markers: their own uncertainty is small
-    image = renderer.render(np.zeros(3), rotations.IDENTITY, position, q, (), light)
-    rows = np.searchsorted(table.ids, perception.estimate(image).marker_ids)
-    truth = camera.undistort(
-        np.array([corners_px(camera, int(m), position, q) for m in table.ids[rows]])
-    )
-    cells = detect.dictionary_of(MODEL.dictionary).markerSize + 2
-    found = corners.refine(
-        image, camera, truth, cells, table.margin_share[rows], table.outlined[rows]
-    )
-    stretch = camera.stretch(truth.mean(axis=1))
-    strong = found.good & (stretch > 1.2 * LEAST_STRETCH)
-    assert strong.any()
-    assert np.all(found.relative_sigma[strong] >= 0.999 * stretch[strong])
+    effects = CameraEffects(camera.width_px, camera.height_px, Effects(), 11)
+    table, cells = MarkerTable.of(MODEL), detect.dictionary_of(MODEL.dictionary).markerSize + 2
+    perception, squares = Perception(camera, MODEL), []
+    for number, (position, q, light) in enumerate(views(camera, 4, 0.75, 0.8)):
+        exact = renderer.render(np.zeros(3), rotations.IDENTITY, position, q, (), light)
+        image = effects.apply(exact, 0, number)
+        rows = np.searchsorted(table.ids, perception.estimate(image).marker_ids)
+        at = [corners_px(camera, int(m), position, q) for m in table.ids[rows]]
+        truth = camera.undistort(np.array(at))
+        found = corners.refine(
+            image, camera, truth, cells, table.margin_share[rows], table.outlined[rows]
+        )
+        strong = found.good & (camera.stretch(truth.mean(axis=1)) > 1.2 * LEAST_STRETCH)
+        off = (found.corners_px - truth)[strong].reshape(-1, 8, 1)
+        squares += np.square(found.errors.whitening[strong] @ off).ravel().tolist()
+    assert len(squares) > 60
+    assert 0.1 < np.median(squares) < 0.8  # 0.45 of a normal distribution
+
+
+def test_whitened_errors_do_not_depend_on_coordinates():
+    camera = LENSES["fisheye"]
+    square = np.array([[-3.0, 3.0], [3.0, 3.0], [3.0, -3.0], [-3.0, -3.0]])
+    ideal = camera.undistort(np.array([[330.0, 200.0], [60.0, 60.0]]))[:, None] + square
+    frames, rng = MarkerFrames.of(camera, ideal), np.random.default_rng(3)
+    moved = ideal + 1e-4 * rng.normal(size=ideal.shape)
+    white, at = rng.normal(size=(2, 8, 8)), frames.into(ideal)
+    in_frame = white @ (frames.into(moved) - at).reshape(2, 8, 1)
+    outside = frames.whitening_of(white, at) @ (moved - ideal).reshape(2, 8, 1)
+    assert np.allclose(in_frame, outside, rtol=1e-3, atol=1e-7)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.perception import Perception, corners, detect, pnp
+from chaserdock_agents.chaser.perception.corners import CornerErrors
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel, target_model
@@ -26,7 +27,7 @@ class Scene:
         self.camera, self.model = Camera.from_hfov(640, 480, HFOV), model
         self.renderer = Renderer(self.camera, model, None, Effects().point_spread_px)
         self.effects = CameraEffects(640, 480, Effects(), 11)
-        self.perception = Perception(self.camera, model, small_markers=True)
+        self.perception = Perception(self.camera, model)
 
     def image(self, position, q, number=0, light=(0.2, 0.3, -1.0)):
         exact = self.renderer.render(
@@ -117,12 +118,12 @@ def test_two_detections_of_one_marker_do_not_contradict_each_other():
     position = np.array([0.05, -0.02, 0.8])
     px = camera.project_ideal(rotations.rotate(q, table.corners[row]) + position)
     outer = px.mean(axis=0) + 1.1 * (px - px.mean(axis=0))
-    both = np.array([px, outer])
-    solutions, used = pnp.solve(camera, table, np.array([row, row]), both, np.ones(2))
+    both, errors = np.array([px, outer]), CornerErrors.even(np.full(2, 0.1))
+    solutions, used = pnp.solve(camera, table, np.array([row, row]), both, errors)
     assert solutions
     assert len(used) == 1
     apart = np.array([px, px + 150.0])
-    assert pnp.solve(camera, table, np.array([row, row]), apart, np.ones(2))[0] == ()
+    assert pnp.solve(camera, table, np.array([row, row]), apart, errors)[0] == ()
 
 
 def test_one_far_marker_always_lists_its_true_pose():
@@ -142,7 +143,7 @@ def test_one_far_marker_always_lists_its_true_pose():
 
 @pytest.mark.slow
 def test_covariance_is_consistent_for_small_and_large_markers():
-    """Small ones are far more accurate in a good light than in a bad one."""
+    """Sixty views of a kind, so that the mean of one scatters by a tenth and more."""
     means = []
     for name, near_m, far_m in (
         ("servicer", 0.5, 1.5), ("servicer", 2.5, 4.0), ("servicer", 4.0, 5.5),
@@ -154,8 +155,8 @@ def test_covariance_is_consistent_for_small_and_large_markers():
             if solutions:
                 squares.append(nees_of(solutions, position, q))
         means.append(np.mean(squares))
-        assert means[-1] < 15.0
-    assert 3.0 < np.mean(means) < 7.5, means
+        assert 3.0 < means[-1] < 10.0
+    assert 4.5 < np.mean(means) < 7.5, means
 
 
 def test_corners_that_cannot_be_fitted_are_kept_with_the_error_of_a_contour():
@@ -164,5 +165,3 @@ def test_corners_that_cannot_be_fitted_are_kept_with_the_error_of_a_contour():
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     quads = np.array([300.0 + 10.0 * square, 200.0 + 100.0 * square])
     assert corners.coarse_sigma_px(camera, quads) == pytest.approx([1.0, 6.0])
-    assert corners.small_factor(np.array([8.0, 1.7]), np.array([False, False]))[0] == 1.0
-    assert corners.small_factor(np.array([1.7]), np.array([False]))[0] > 5.0

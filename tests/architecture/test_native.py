@@ -112,19 +112,21 @@ def test_every_instruction_set_sees_the_same_bits(
             )
             cv2.fillConvexPoly(image, outline, level, cv2.LINE_AA, 4)
     image = np.asarray(cv2.GaussianBlur(image, (7, 7), 0.7), dtype=np.uint8)
-    points = rng.uniform(-0.3, 0.3, (8, 3))
+    points = rng.uniform(-0.3, 0.3, (2, 4, 3))
     truth = pose_at([0.1, -0.05, 1.5], [0.4, -2.0, 0.9])
     pixels = camera.project_ideal(points @ truth.rotation.T + truth.position) + rng.normal(
-        0.0, 0.1, (8, 2)
+        0.0, 0.1, (2, 4, 2)
     )
+    whitening = rng.normal(0.0, 0.3, (2, 8, 8)) + np.eye(8)
     start = pose_at([0.0, 0.0, 1.2], [0.0, -1.6, 0.5])
 
     def seen() -> list[NDArray[Any]]:
         found = corners.refine(image, camera, quads, 6, margin, outlined)
-        pose = refine.refine(camera.matrix(), points, pixels, np.ones(16), start)
+        pose = refine.refine(camera.matrix(), points, pixels, whitening, start)
         assert pose is not None
         np.testing.assert_allclose(pose.rotation, truth.rotation, atol=0.01)
-        return [found.corners_px, found.good, found.relative_sigma, pose.position, pose.rotation]
+        errors = found.errors.whitening, found.errors.common
+        return [found.corners_px, found.good, *errors, pose.position, pose.rotation]
 
     expected = seen()
     assert 0 < expected[1].sum() < 12
@@ -232,25 +234,26 @@ def test_a_refined_pose_is_where_the_error_no_longer_falls(turn: float) -> None:
     """
     rng = np.random.default_rng(5)
     matrix = np.array([[600.0, 0.0, 320.0], [0.0, 590.0, 240.0], [0.0, 0.0, 1.0]])
-    points = rng.uniform(-0.3, 0.3, (8, 3))
+    points = rng.uniform(-0.3, 0.3, (2, 4, 3))
     truth = pose_at([0.1, -0.05, 1.5], [0.4, -2.0, 0.9])
     at = points @ truth.rotation.T + truth.position
-    pixels = at[:, :2] / at[:, 2:] * [600.0, 590.0] + [320.0, 240.0] + rng.normal(0.0, 0.2, (8, 2))
-    weight = np.repeat(rng.uniform(0.5, 1.0, 8), 2)
+    pixels = at[..., :2] / at[..., 2:] * [600.0, 590.0] + [320.0, 240.0]
+    pixels += rng.normal(0.0, 0.2, pixels.shape)
+    whitening = rng.normal(0.0, 0.3, (2, 8, 8)) + np.eye(8)
     start = refine.PoseInCamera(
         truth.position, refine.rotation_matrix([0.0, turn, 0.0]) @ truth.rotation
     )
-    pose = refine.refine(matrix, points, pixels, weight, start)
+    pose = refine.refine(matrix, points, pixels, whitening, start)
     assert pose is not None
     np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-14)
-    found = refine.residual_of(matrix, points, pixels, weight, pose)
+    found = refine.residual_of(matrix, points, pixels, whitening, pose)
     assert found is not None
     residual, jacobian = found
     step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
     assert np.abs(step).max() < 1e-5
     assert (
         refine.refine(
-            matrix, points - [0.0, 0.0, 50.0], pixels, weight, pose_at([0, 0, 1], [0, 0, 0])
+            matrix, points - [0.0, 0.0, 50.0], pixels, whitening, pose_at([0, 0, 1], [0, 0, 0])
         )
         is None
     )

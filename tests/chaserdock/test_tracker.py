@@ -58,8 +58,7 @@ def test_two_hundred_views_of_a_sheet_at_one_metre() -> None:
     assert turned.max() < math.radians(0.5)
     assert np.median(away) <= 1e-4
     assert np.median(turned) <= math.radians(0.02)
-    # Six are expected. Sharp images are better than the least noise that the covariance assumes.
-    assert 0.5 < squares.mean() < 7.5
+    assert 4.0 < squares.mean() < 7.5  # six are expected
 
 
 @pytest.mark.slow(1)
@@ -68,7 +67,7 @@ def test_small_images_are_as_accurate_as_their_covariance_says() -> None:
     errors, squares, lost = errors_of(lens, 20, Photograph(lens))
     assert lost == 0
     assert np.median(np.linalg.norm(errors[:, :3], axis=1)) < 4e-4
-    assert 1.0 < squares.mean() < 7.5
+    assert 3.0 < squares.mean() < 9.0  # of twenty views
 
 
 @pytest.fixture(scope="module")

@@ -55,7 +55,8 @@ def test_a_tumble_shows_ratios_and_centre(tumble: TumbleOutcome) -> None:
 def test_relative_poses_are_consistent_although_the_inertia_is_wrong(tumble: TumbleOutcome) -> None:
     assert 0.5 < tumble.nees < 15.0
     sure = ("target.inertia_sigma_share=1e-6", "target.centre_of_mass_sigma_m=1e-6")
-    assert watch_tumble(scenario_of([4.0, -3.0, 5.0], *sure), 13.0).nees > 30.0
+    wrong = watch_tumble(scenario_of([4.0, -3.0, 5.0], *sure), 13.0).nees
+    assert wrong > 3.0 * tumble.nees, (wrong, tumble.nees)
 
 
 def test_a_spin_about_a_principal_axis_leaves_the_ratios_unknown(tumble: TumbleOutcome) -> None:

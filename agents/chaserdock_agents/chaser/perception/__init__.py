@@ -69,7 +69,7 @@ def named_perception(
     """
     match name:
         case "default" | "paper" | "paper_iterative" as method:
-            return Perception(camera, target.shape(), method, small_markers=single_images)
+            return Perception(camera, target.shape(), method)
         case "model":
             perception = ModelPerception(camera, tracker_mesh(target), single_images=single_images)
             perception.prepare()

@@ -20,7 +20,11 @@ from chaserdock_models.camera import Camera
 from numpy.typing import NDArray
 
 from . import pnp
+from .corners import CornerErrors
 from .detect import NOTHING, Detections
+from .refine import PoseInCamera
+
+LEAST_SIGMA_PX = 0.015  # of a corner: no corner in an image is better (docs/evidence/cameras.md)
 
 
 def detect(
@@ -70,10 +74,13 @@ def solve(
     rotation = np.asarray(cv2.Rodrigues(rvec)[0], dtype=float)
     if not ok or not np.all(np.isfinite(position)) or not np.all(np.isfinite(rotation)):
         return ()
-    floor = pnp.SIGMA_FLOOR_SINGLE_PX if len(points_trf_m) == 1 else pnp.SIGMA_FLOOR_PX
-    sigma = np.ones(len(points))
-    result = pnp.pose_covariance(camera, points, pixels, position, rotation, floor, sigma)
+    pose, unweighted = (
+        PoseInCamera(position, rotation),
+        CornerErrors.even(np.ones(len(points_trf_m))),
+    )
+    result = pnp.pose_covariance(camera, points_trf_m, corners_ideal_px, unweighted, pose)
     if result is None:
         return ()
+    covariance = max(LEAST_SIGMA_PX**2, result[2] / (2 * len(points) - 6)) * result[0]
     rms = pnp.reprojection_rms_px(camera, points, pixels, position, rotation)
-    return (pnp.TargetPose(position, rotations.from_matrix(rotation), result[0], rms),)
+    return (pnp.TargetPose(position, rotations.from_matrix(rotation), covariance, rms),)

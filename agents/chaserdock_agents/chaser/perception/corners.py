@@ -53,31 +53,49 @@ class _Settings(Structure):
             # A border narrower than ``strip_px`` (``partial_px`` where it ends at neighbours beside
             # a part of the side) is fitted with its outer edge at once. A wider one is so in the
             # last round, if grey levels fall there by ``least_fall`` of the rise at the side, and
-            # both fits agree to ``agreement_px``.
-            "strip_px", "partial_px", "least_fall", "agreement_px",
+            # both fits agree to ``agreement_px`` and ``agreement_sigmas`` of the fit without it.
+            "strip_px", "partial_px", "least_fall", "agreement_px", "agreement_sigmas",
             # Prior of an edge's blur (pixel and lens together): mean and standard deviation of the
             # logarithm of its sigma in px.
             "log_edge_sigma", "edge_sigma_spread",
+            # Prior of the change of the light along a side, as a share: standard deviation.
+            "fade_spread",
+            # Columns whose pixels are taken for independent, beside those of a marker, which tell
+            # how alike their errors are.
+            "alike_columns",
             "rounds", "iterations", "strip_iterations",
-            # Corners are less accurate at small cells or borders (px) and at low contrast (grey
-            # levels): relative sigma sqrt(1 + (uncertain_px / width)^2 + (uncertain_level /
-            # contrast)^2), fitted to the errors in rendered images.
-            "uncertain_px", "uncertain_level",
+            # Standard deviation, px, of a side's line beyond what the noise of its pixels explains.
+            # At each end by itself: of any side, and of one along rows or columns of pixels, by 1 +
+            # 2 n if it crosses n of them. Of the whole line: with cells 1 px wide, by the inverse
+            # square of the width; with a border 1 px wide, and with one whose outer edge is fitted,
+            # likewise; with a fitted outer edge that neighbours cut, outwards on all sides, and
+            # otherwise. Share of the first three variances that all lines of an image have in
+            # common. For each unit by which the logarithm of the blur differs from the prior by
+            # more than ``free_blur``; and if it is larger, and only the fit with the outer edge is
+            # there, as where something brighter adjoins.
+            "least_sigma_px", "aligned_sigma_px", "fine_sigma_px", "border_sigma_px",
+            "outer_sigma_px", "cut_sigma_px", "cut_spread_px", "common_share",
+            "free_blur", "blur_sigma_px", "adjoining_sigma_px",
         )
     ]  # fmt: skip
 
 
-# Values by the least corner errors in rendered images (benchmarks/perception.py, ``markers``).
+# Values by the least corner errors in rendered images (benchmarks/perception.py, ``markers``);
+# standard deviations by the lines' errors there and in photographs of sheets
+# (docs/evidence/cameras.md#errors-of-corners).
 SETTINGS = _Settings(
     0.45, 1.25,
     8.0, 0.4, 4.0,
     0.1, 0.9, 8, 11, 3.5, 0.6,
     48, 2.5, 0.2,
     2.75, 1.2, 1.5,
-    2.5, 1.5, 0.25, 0.08,
+    2.5, 1.5, 0.25, 0.08, 3.0,
     float(np.log(0.67)), 0.15,
+    0.03, 32.0,
     2, 2, 4,
-    2.0, 120.0,
+    0.003, 0.015, 0.23, 0.08,
+    0.045, 0.3, 0.15, 0.2,
+    0.08, 0.03, 1.2,
 )  # fmt: skip
 
 # Corners of a unit square, as those of a marker.
@@ -85,63 +103,70 @@ _SQUARE = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], dtype=np.float32)
 
 
 @dataclass(frozen=True)
+class CornerErrors:
+    """What is known of the errors of the corners of n markers, ideal px.
+
+    ``whitening`` (n, 8, 8): turns those of a marker's corners, without what all markers of an image
+    have in common, into independent ones of unit variance. ``common`` (n, 8): what the common
+    error, of unit variance, is by that.
+    """
+
+    whitening: Array
+    common: Array
+
+    @staticmethod
+    def even(sigma_px: Array) -> CornerErrors:
+        """Return independent errors of standard deviation ``sigma_px`` (n,)."""
+        sigma = np.asarray(sigma_px, dtype=float)[:, None, None]
+        return CornerErrors(np.eye(8) / sigma, np.zeros((len(sigma), 8)))
+
+    def part(self, which: NDArray[np.bool_] | NDArray[np.intp] | list[int]) -> CornerErrors:
+        """Return those of the markers selected by ``which``."""
+        return CornerErrors(self.whitening[which], self.common[which])
+
+    def followed_by(self, others: CornerErrors) -> CornerErrors:
+        """Return those of these markers and of others."""
+        return CornerErrors(
+            np.concatenate([self.whitening, others.whitening]),
+            np.concatenate([self.common, others.common]),
+        )
+
+    def with_others(self, which: NDArray[np.bool_], others: CornerErrors) -> CornerErrors:
+        """Return a copy in which ``others`` replace the markers ``which`` (n,)."""
+        white, common = self.whitening.copy(), self.common.copy()
+        white[which], common[which] = others.whitening, others.common
+        return CornerErrors(white, common)
+
+    def weighted(self, weights: Array) -> CornerErrors:
+        """Return them with the whitened errors times ``weights`` (n, 8)."""
+        return CornerErrors(self.whitening * weights[:, :, None], self.common * weights)
+
+
+@dataclass(frozen=True)
 class Refined:
     """Refined corners of n markers.
 
     ``corners_px`` (n, 4, 2): ideal pixels; unchanged for markers that are not ``good``. ``good``
-    (n,): all four sides are usable. ``relative_sigma`` (n,): uncertainty relative to a large marker
-    of high contrast, at least 1.
+    (n,): all four sides are usable. ``errors``: of the corners.
     """
 
     corners_px: Array
     good: NDArray[np.bool_]
-    relative_sigma: Array
+    errors: CornerErrors
 
     def part(self, which: NDArray[np.bool_]) -> Refined:
         """Return the markers selected by ``which`` (n,)."""
-        return Refined(self.corners_px[which], self.good[which], self.relative_sigma[which])
+        return Refined(self.corners_px[which], self.good[which], self.errors.part(which))
 
     def with_others(self, which: NDArray[np.bool_], others: Refined) -> Refined:
         """Return a copy in which ``others`` replace the markers ``which`` (n,)."""
-        corners, good, sigma = self.corners_px.copy(), self.good.copy(), self.relative_sigma.copy()
-        corners[which], good[which], sigma[which] = (
-            others.corners_px,
-            others.good,
-            others.relative_sigma,
-        )
-        return Refined(corners, good, sigma)
+        corners, good = self.corners_px.copy(), self.good.copy()
+        corners[which], good[which] = others.corners_px, others.good
+        return Refined(corners, good, self.errors.with_others(which, others.errors))
 
 
-@dataclass(frozen=True)
-class SmallMarkers:
-    """Errors of the corners of markers too small for the fit, and of those that it refuses.
-
-    Fitted to rendered images; checked by benchmarks/perception.py (markers-small).
-    """
-
-    # Width of the finer of cell and border, px, below which the error of fitted corners exceeds
-    # what their relative sigma states, by a power of the inverse,
-    wide_px: float = 3.4
-    power: float = 2.5
-    # with a border that ends alike on all sides by a lower power,
-    outlined_power: float = 1.4
-    # up to this factor, half a pixel.
-    most: float = 13.0
-    # Error of a detector's corner, px, least and as a share of the marker's side.
-    coarse_px: float = 1.0
-    coarse_share: float = 0.06
-
-
-SMALL = SmallMarkers()
-
-
-def small_factor(finest_px: Array, outlined: NDArray[np.bool_]) -> Array:
-    """Return the factor (n,), at least 1, of the relative sigma of fitted corners of small markers.
-
-    ``finest_px`` (n,): width of the finer of cell and border; ``outlined`` (n,) as for `refine`.
-    """
-    power = np.where(outlined, SMALL.outlined_power, SMALL.power)
-    return np.clip((SMALL.wide_px / np.maximum(finest_px, 1e-3)) ** power, 1.0, SMALL.most)
+COARSE_PX, COARSE_SHARE = 1.0, 0.06
+"""Error of a detector's corner, px, least and as a share of the marker's side."""
 
 
 def coarse_sigma_px(camera: Camera, corners_ideal_px: Array) -> Array:
@@ -149,9 +174,7 @@ def coarse_sigma_px(camera: Camera, corners_ideal_px: Array) -> Array:
     them.
     """
     stretch = strong_stretch(camera, corners_ideal_px.mean(axis=1))
-    return np.maximum(
-        SMALL.coarse_px * stretch, SMALL.coarse_share * mean_side_px(corners_ideal_px)
-    )
+    return np.maximum(COARSE_PX * stretch, COARSE_SHARE * mean_side_px(corners_ideal_px))
 
 
 def mean_side_px(corners_px: Array) -> Array:
@@ -198,7 +221,8 @@ def refine(
     ends = np.array(outlined, dtype=np.uint8, order="C")
     if min(image.shape) < 2:
         raise ValueError(f"an image of {image.shape} has no corners")
-    good, sigma = np.zeros(n, dtype=np.uint8), np.ones(n)
+    good = np.zeros(n, dtype=np.uint8)
+    white, common = np.zeros((n, 8, 8)), np.zeros((n, 8))
     k = camera
     matrix = (c_double * 4)(k.fx_px, k.fy_px, k.cx_px, k.cy_px)
     lens = byref(native_lens(camera)) if camera.distorts else None
@@ -206,6 +230,8 @@ def refine(
         c_void_p(image.ctypes.data), c_int64(image.shape[0]), c_int64(image.shape[1]),
         matrix, lens, address(frames.to_ray), address(frames.framed), byref(SETTINGS),
         c_double(cells),
-        c_int64(n), address(margin), address(ends), address(corners), address(good), address(sigma),
+        c_int64(n), address(margin), address(ends), address(corners), address(good),
+        address(white), address(common),
     )  # fmt: skip
-    return Refined(frames.out_of(corners), good.view(np.bool_), sigma * frames.stretch)
+    errors = CornerErrors(frames.whitening_of(white, corners), common)
+    return Refined(frames.out_of(corners), good.view(np.bool_), errors)

@@ -61,11 +61,11 @@ class _Windows(NamedTuple):
 
 # OpenCV's own distance is 0.125.
 _WINDOWS = (_Windows(7, 7, 16, 0.125, 40.0, 0.15), _Windows(7, 23, 16, 0.125, 40.0, 0.15))
-# Settings of a second look, where nothing was found, at twice the cost (9.5 instead of 4.4 ms at
-# 1280 x 960). A window of 3 px finds small markers; the small distance keeps candidates inside each
-# other apart, such as the outer edge of a white border. The perimeter (3 % of 640 px) and the share
-# of the border are OpenCV's own.
-_THOROUGH = _Windows(3, 23, 10, 0.01, 19.0, 0.35)
+# Settings of a second look, where nothing was found, at twice the cost (11 instead of 4 ms at 1280
+# x 720): those that find most far markers (benchmarks/perception.py, ``markers-small``). Narrow
+# windows in small steps find small markers; the small distance keeps candidates inside each other
+# apart, such as the outer edge of a white border. The share of the border is OpenCV's own.
+_THOROUGH = _Windows(3, 23, 4, 0.02, 8.0, 0.35)
 
 NOTHING = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
 
@@ -91,10 +91,10 @@ def detect(
     OpenCV's contours, accurate to about a pixel.
 
     A threshold window of 7 px detects nearly as many markers as 7 and 23 px together, in half the
-    time; the second is used if the first detects fewer than two. ``thorough`` uses 3, 13 and 23 px
-    and separates adjacent candidates: slower, for narrow white borders. With ``enough`` a large
-    image is searched at half size first, in a third of the time; the result is used if it has that
-    many markers.
+    time; the second is used if the first detects fewer than two. ``thorough`` uses 3 to 23 px and
+    separates adjacent candidates: slower, for far markers and narrow white borders. With ``enough``
+    a large image is searched at half size first, in a third of the time; the result is used if it
+    has that many markers.
     """
     left, top, right, bottom = region or (0, 0, image.shape[1], image.shape[0])
     part = image[top:bottom, left:right]

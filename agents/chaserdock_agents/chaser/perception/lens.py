@@ -94,3 +94,16 @@ class MarkerFrames:
             ray = np.column_stack([corners[k], np.ones(len(corners[k]))]) @ self.to_ray[k].T
             out[k] = ray[:, :2] / ray[:, 2:] * (c.fx_px, c.fy_px) + (c.cx_px, c.cy_px)
         return out
+
+    def whitening_of(self, whitening: Array, corners: Array) -> Array:
+        """Convert the whitening (n, 8, 8) of errors of ``corners`` (n, 4, 2) to that of errors in
+        ideal pixels.
+        """
+        out = whitening.copy()
+        focal = np.array([[self.camera.fx_px], [self.camera.fy_px]])
+        for k in np.flatnonzero(self.framed):
+            for c, (x, y) in enumerate(corners[k]):
+                ray = self.to_ray[k] @ (x, y, 1.0)
+                by = self.to_ray[k, :2, :2] - np.outer(ray[:2] / ray[2], self.to_ray[k, 2, :2])
+                out[k, :, 2 * c : 2 * c + 2] @= np.linalg.inv(focal * by / ray[2])
+        return out

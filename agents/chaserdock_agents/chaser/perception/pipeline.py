@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import baseline as paper
 from . import corners, detect, pnp
+from .corners import CornerErrors
 from .pnp import FurtherMarkers, TargetPose
 from .reading import CellReader
 from .refine import PoseInCamera
@@ -65,28 +66,30 @@ class PerceptionResult:
 _INNER_PX = (3.5, 7.0, 10.5)
 """Distances inside a marker's side, px, of a contour that a threshold window finds there: half a
 window, of up to 23 px, in steps that the fit of sides reaches."""
-_NO_COARSE = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2)), np.zeros(0)
+_NO_COARSE = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2)), CornerErrors.even(np.zeros(0))
 
 
 class _Further:
     """Markers to be added to a pose: ``coarse`` detections, whose sides cannot be fitted, with row,
-    corners (ideal px) and relative sigma, and missed ones that are read by their cells.
+    corners (ideal px) and their errors, and missed ones that are read by their cells.
     """
 
     def __init__(
         self,
         perception: Perception,
         image: NDArray[np.uint8],
-        coarse: tuple[NDArray[np.intp], Array, Array],
+        coarse: tuple[NDArray[np.intp], Array, CornerErrors],
     ) -> None:
         self._perception, self._image, self._coarse = perception, image, coarse
         self._rows, self._px, _ = _NO_COARSE
 
     def markers(self, pose: PoseInCamera, used: NDArray[np.intp]) -> FurtherMarkers:
         """Return the markers that the image shows beside the ``used`` rows at a pose."""
-        by, table = self._perception, self._perception.table
+        by = self._perception
         read = by.reader.read(self._image, by.camera, pose, used)
-        rows, (coarse, px, sigma) = read.rows, self._coarse
+        rows, (coarse, px, errors) = read.rows, self._coarse
+        new = ~np.isin(coarse, used)
+        coarse, px, errors = coarse[new], px[new], errors.part(new)
         if len(rows):
             refined = by.refined(self._image, read.corners_px[rows], rows)
             rows = rows[refined.good]
@@ -94,13 +97,9 @@ class _Further:
             fitted = refined.part(refined.good)
             coarse = np.concatenate([rows, coarse[left]])
             px = np.concatenate([fitted.corners_px, px[left]])
-            factor = corners.small_factor(read.finest_px[rows], table.outlined[rows])
-            sigma = np.concatenate([fitted.relative_sigma * factor, sigma[left]])
+            errors = fitted.errors.followed_by(errors.part(left))
         self._rows, self._px = coarse, px
-        finest_px, small = read.finest_px[used], None
-        if finest_px.max() < corners.SMALL.wide_px:
-            small = corners.small_factor(finest_px, table.outlined[used])
-        return FurtherMarkers(coarse, px, sigma, small)
+        return FurtherMarkers(coarse, px, errors)
 
     def after(self, rows: NDArray[np.intp], px: Array) -> tuple[NDArray[np.intp], Array]:
         """Return rows and corners of detections, followed by those of `markers`."""
@@ -113,18 +112,11 @@ class Perception:
     """Estimates the pose of one target model in the images of one camera.
 
     Stateless: `estimate` depends on its arguments only. ``method``: "default", or for the paper's
-    baseline "paper" (EPnP) or "paper_iterative". ``small_markers``: use markers too small for the
-    fit of their sides, too, as single photographs need; chasers fly without, as `simulate` draws
-    their measurements. Raises ValueError for another method, or for an unknown marker dictionary.
+    baseline "paper" (EPnP) or "paper_iterative". Raises ValueError for another method, or for an
+    unknown marker dictionary.
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        model: TargetModel,
-        method: Method = "default",
-        small_markers: bool = False,
-    ) -> None:
+    def __init__(self, camera: Camera, model: TargetModel, method: Method = "default") -> None:
         if method not in get_args(Method):
             raise ValueError(
                 f"unknown perception method {method!r}; known: {', '.join(get_args(Method))}"
@@ -132,7 +124,6 @@ class Perception:
         self.camera = camera
         self.model = model
         self.method: Method = method
-        self._small_markers = small_markers
         self._dictionary = detect.dictionary_of(model.dictionary)
         self.table = pnp.MarkerTable.of(model)
         # Targets with many markers per face do not need the small ones that are lost at half size.
@@ -200,21 +191,17 @@ class Perception:
                 shifted = corners.inside_border(px[lost], share[lost])
                 refined = refined.with_others(lost, self.refined(image, shifted, rows[lost]))
             lost = ~refined.good
-            sigma = corners.coarse_sigma_px(self.camera, px[lost]) / pnp.SIGMA_FLOOR_PX
-            if self._small_markers:
-                coarse = rows[lost], px[lost], sigma
+            errors = CornerErrors.even(corners.coarse_sigma_px(self.camera, px[lost]))
+            coarse = rows[lost], px[lost], errors
             refined, rows = refined.part(refined.good), rows[refined.good]
-        px, sigma = refined.corners_px, refined.relative_sigma
-        if not self._small_markers:
-            solutions, used = pnp.solve(self.camera, self.table, rows, px, sigma)
-            return self._sighting(found.ids, solutions, self.table.ids[rows[used]], px[used])
+        px, errors = refined.corners_px, refined.errors
         further = _Further(self, image, coarse)
-        solutions, used = pnp.solve(self.camera, self.table, rows, px, sigma, further.markers)
+        solutions, used = pnp.solve(self.camera, self.table, rows, px, errors, further.markers)
         if not solutions and thorough and len(coarse[0]):
             rows, px = np.concatenate([rows, coarse[0]]), np.concatenate([px, coarse[1]])
-            sigma = np.concatenate([sigma, coarse[2]])
+            errors = errors.followed_by(coarse[2])
             further = _Further(self, image, _NO_COARSE)
-            solutions, used = pnp.solve(self.camera, self.table, rows, px, sigma, further.markers)
+            solutions, used = pnp.solve(self.camera, self.table, rows, px, errors, further.markers)
         rows, px = further.after(rows, px)
         return self._sighting(found.ids, solutions, self.table.ids[rows[used]], px[used])
 

@@ -2,8 +2,8 @@
 """Compute the pose of a target from the corners of its markers, in ideal (undistorted) pixels.
 
 Candidates from SQPnP (G. Terzakis, M. Lourakis, ECCV 2020) and IPPE (T. Collins, A. Bartoli, IJCV
-2014), a consensus over markers against false ids, Levenberg-Marquardt on the reprojection error,
-and sigma^2 (J'J)^-1 as covariance. OpenCV's EPnP is not used, as it fails on coplanar points.
+2014), a consensus over markers against false ids, Levenberg-Marquardt on the whitened reprojection
+error, and (J'J)^-1 as covariance. OpenCV's EPnP is not used, as it fails on coplanar points.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import cv2
@@ -22,17 +22,19 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel, clear_margin_m
 from numpy.typing import NDArray
 
+from .corners import CornerErrors
 from .refine import PoseInCamera, refine, residual_of, rotation_matrix
 from .views import count_visible_markers, marker_errors, squared_errors
 
 Indices = NDArray[np.intp]
 
-# Least corner noise, px: with several markers, and with one, which leaves only two degrees of
-# freedom.
-SIGMA_FLOOR_PX, SIGMA_FLOOR_SINGLE_PX = 0.015, 0.013
-# Noise above the least comes from light, compression or the pixel grid, which move the four corners
-# of a marker together. So with several markers it averages out over markers, not over corners.
-COMMON_PER_MARKER = 4.0
+# Weight of the stated errors of corners, in residuals, where these tell how large errors are.
+# Larger: images with more or other errors than stated are believed too much; smaller: the
+# covariance of few corners scatters.
+_PRIOR_RESIDUALS = 4.0
+# Least factor of the stated variance by residuals: these do not show what all markers of an image
+# have in common. Larger: too large covariances; smaller: too small ones of many small markers.
+_LEAST_FACTOR = 0.6
 # Least cosine of the viewing angle of a single marker: at a more grazing angle its tilt is poorly
 # determined, with an optimistic covariance.
 MIN_SINGLE_COSINE = 0.25
@@ -54,8 +56,10 @@ _PLANE_RMS_PX = 1.0
 # Of a plane's two coarse poses, one counts as the refined pose if its angle to that is this share
 # of the other's.
 _SAME_POSE_SHARE = 0.25
-# Markers from which on the residuals of the first ones tell the noise, without the further ones.
-_TELLING_MARKERS = 3
+# Squared error of a side, of which two are expected, above which it may be wrong: one of 3,000
+# right ones is. So much must an image explain better without it, in units of the noise; its errors
+# count by this weight then. So many sides are tried, and so many found in one image.
+_WRONG_SIDE_SQUARE, _WRONG_SIDE_WEIGHT, _SUSPECTS, _MOST_WRONG_SIDES = 16.0, 0.02, 8, 4
 # A single marker counts as a false id if this many others should be as visible and none is
 # detected.
 _MAX_MISSING = 2
@@ -131,7 +135,7 @@ class _DetectedMarkers:
     """n detections with what is known of their markers.
 
     ``which``: row of each in the marker table. ``points`` (n, 4, 3): corners in TRF. ``pixels`` (n,
-    4, 2): ideal. ``sigma`` (n,): relative uncertainty.
+    4, 2): ideal. ``errors``: of each marker's corners.
     """
 
     camera: Camera
@@ -139,17 +143,12 @@ class _DetectedMarkers:
     which: Indices
     points: Array
     pixels: Array
-    sigma: Array
+    errors: CornerErrors
 
     @cached_property
     def normals(self) -> Array:
         """Unit vectors (n, 3) in TRF, out of the marked faces."""
         return self.table.normals[self.which]
-
-    @cached_property
-    def weight(self) -> Array:
-        """Weight of every pixel coordinate (8 n,)."""
-        return np.repeat(1.0 / self.sigma, 8)
 
     @cached_property
     def plane_poses(self) -> list[PoseInCamera]:
@@ -167,7 +166,7 @@ class _DetectedMarkers:
             self.which[of],
             self.points[of],
             self.pixels[of],
-            self.sigma[of],
+            self.errors.part(of),
         )
 
 
@@ -175,14 +174,12 @@ class _DetectedMarkers:
 class FurtherMarkers:
     """k markers that fewer or worse corners than those of a pose show, to be added to it.
 
-    ``which`` (k,), ``corners_px`` (k, 4, 2), ideal, and ``relative_sigma`` (k,) as for `solve`.
-    ``small`` (n,): factor of the relative sigma of the markers of the pose, if all are small.
+    ``which`` (k,), ``corners_px`` (k, 4, 2), ideal, and ``errors`` as for `solve`.
     """
 
     which: Indices
     corners_px: Array
-    relative_sigma: Array
-    small: Array | None
+    errors: CornerErrors
 
 
 def solve(
@@ -190,15 +187,14 @@ def solve(
     table: MarkerTable,
     which: Indices,
     corners_ideal_px: Array,
-    relative_sigma: Array,
+    errors: CornerErrors,
     further: Callable[[PoseInCamera, Indices], FurtherMarkers] | None = None,
 ) -> tuple[tuple[TargetPose, ...], Indices]:
     """Return the poses, best first, that explain the detections, and the indices of those used.
 
     ``which`` (n,): row of ``table`` of each detection; a row may occur more than once.
-    ``corners_ideal_px`` (n, 4, 2). ``relative_sigma`` (n,): uncertainty of a detection's corners,
-    relative to the best. ``further``: markers to be added to a pose from given rows of ``table``;
-    their indices follow those of the detections.
+    ``corners_ideal_px`` (n, 4, 2). ``errors``: of their corners. ``further``: markers to be added
+    to a pose from given rows of ``table``; their indices follow those of the detections.
 
     Returns no pose and no indices if nothing is explained well, if a single marker is seen at a
     grazing angle or without others that its pose would show, or if two equally large groups of
@@ -214,7 +210,7 @@ def solve(
         which,
         table.corners[which],
         np.array(corners_ideal_px, dtype=float, order="C"),
-        relative_sigma,
+        errors,
     )
     found = _consensus(seen)
     if found is None:
@@ -229,13 +225,19 @@ def solve(
     seen = first = seen.part(used)
     if further is not None:
         seen, pose, added = _with_further(first, pose, further(pose, first.which))
+        if len(used) == 1 and not added:  # its other pose may show them
+            for other in _other_than(pose, first.plane_poses)[:1]:
+                refined = _refined(first, other)
+                if refined is not None:
+                    again = _with_further(first, refined, further(refined, first.which))
+                    seen, pose, added = again if again[2] else (seen, pose, added)
         used = used + [len(which) + k for k in added]
+    seen, pose = _without_wrong_sides(seen, pose)
     poses = [pose]
     # Coplanar corners, as those of a single marker, may have a second pose.
     if len(used) == 1 or np.ptp(seen.points @ seen.normals[0]) < 1e-6:
         poses += _other_than(pose, first.plane_poses)
-    floor = SIGMA_FLOOR_SINGLE_PX if len(used) == 1 else SIGMA_FLOOR_PX
-    solutions = _solutions(seen, poses, floor, len(first.which))
+    solutions = _solutions(seen, poses)
     if not solutions or solutions[0].reprojection_rms_px > MAX_RMS_PX:
         return nothing
     if len(used) == 1:
@@ -245,37 +247,25 @@ def solve(
 
 
 def pose_covariance(
-    camera: Camera,
-    points_trf_m: Array,
-    pixels: Array,
-    position: Array,
-    rotation: Array,
-    floor_px: float,
-    sigma: Array,
-    common: float = 1.0,
-    telling: int | None = None,
-) -> tuple[Array, float] | None:
-    """Return the covariance (6, 6) of a pose, as in `TargetPose`, and its weighted sum of squares.
+    camera: Camera, points_trf_m: Array, pixels: Array, errors: CornerErrors, pose: PoseInCamera
+) -> tuple[Array, Array, float] | None:
+    """Return the covariance (6, 6) of a pose, as in `TargetPose`, for the stated errors: by those
+    that corners have by themselves, and by the common one; and its whitened sum of squares, without
+    what the common error explains.
 
-    The pose fits n points (n, 3) to n ideal pixels (n, 2) with relative uncertainties ``sigma``
-    (n,). The covariance is s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``, of
-    which the part above the floor counts ``common`` times; of the first ``telling`` points if
-    given. None if the pose is not observable or has points behind the camera.
+    The pose fits the corners (n, 4, 3) of n markers to ideal pixels (n, 4, 2) with ``errors``. None
+    if the pose is not observable or has points behind the camera.
     """
-    pose = PoseInCamera(position, rotation)
-    found = residual_of(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
+    found = residual_of(camera.matrix(), points_trf_m, pixels, errors.whitening, pose)
     if found is None:
         return None
     residual, jacobian = found
     rss = float(residual @ residual)
     # By position and dtheta: a rotation phi in camera axes is R dtheta.
-    jacobian = np.concatenate([jacobian[:, 3:], jacobian[:, :3] @ rotation], axis=1)
+    jacobian = np.concatenate([jacobian[:, 3:], jacobian[:, :3] @ pose.rotation], axis=1)
     information = jacobian.T @ jacobian
     if not (math.isfinite(rss) and math.isfinite(float(information.sum()))):
         return None
-    told = residual if telling is None else residual[: 2 * telling]
-    excess = float(told @ told) / (len(told) - 6) - floor_px**2
-    variance = floor_px**2 + common * max(0.0, excess)
     # Metres and radians are scaled to comparable size before the condition number is checked.
     each = [1.0 / math.sqrt(max(d, 1e-300)) for d in information.diagonal().tolist()]
     scale = np.array([[a * b for b in each] for a in each])
@@ -284,7 +274,11 @@ def pose_covariance(
     if not least > 1e-12 * largest:
         return None
     inverse = (vectors / values) @ vectors.T * scale
-    return variance * 0.5 * (inverse + inverse.T), rss
+    common = errors.common.ravel()
+    moved = inverse @ (jacobian.T @ common)
+    left = common - jacobian @ moved
+    rss -= float(left @ residual) ** 2 / (1.0 + float(left @ left))
+    return 0.5 * (inverse + inverse.T), np.outer(moved, moved), rss
 
 
 def reprojection_rms_px(
@@ -357,8 +351,7 @@ def _candidates(seen: _DetectedMarkers) -> Iterator[PoseInCamera]:
 
 
 def _refined(seen: _DetectedMarkers, pose: PoseInCamera) -> PoseInCamera | None:
-    points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
-    return refine(seen.camera.matrix(), points, pixels, seen.weight, pose)
+    return refine(seen.camera.matrix(), seen.points, seen.pixels, seen.errors.whitening, pose)
 
 
 def _plane_poses(seen: _DetectedMarkers) -> list[PoseInCamera]:
@@ -436,63 +429,97 @@ def _with_further(
     and the indices of these in ``further``.
     """
     table, which = seen.table, further.which
-    if further.small is None and not len(which):
+    if not len(which):
         return seen, pose, []
-    sigma = seen.sigma if further.small is None else seen.sigma * further.small
-    kept: list[int] = []
-    if len(which):
-        points, normals = table.corners[which], table.normals[which]
-        error = marker_errors(seen.camera, points, normals, further.corners_px, pose)
-        gate = np.clip(
-            _FINE_GATE_SIGMAS * SIGMA_FLOOR_PX * further.relative_sigma,
-            _FINE_GATE_PX,
-            _COARSE_GATE_PX,
-        )
-        near = [e if e < g else math.inf for e, g in zip(error, gate.tolist(), strict=True)]
-        kept = _one_of_each(which.tolist(), near, _COARSE_GATE_PX)
-    if further.small is None and not kept:
+    points, normals = table.corners[which], table.normals[which]
+    error = marker_errors(seen.camera, points, normals, further.corners_px, pose)
+    sigma_px = np.sqrt(8.0 / np.square(further.errors.whitening).sum(axis=(1, 2)))
+    gate = np.clip(_FINE_GATE_SIGMAS * sigma_px, _FINE_GATE_PX, _COARSE_GATE_PX)
+    near = [e if e < g else math.inf for e, g in zip(error, gate.tolist(), strict=True)]
+    kept = _one_of_each(which.tolist(), near, _COARSE_GATE_PX)
+    if not kept:
         return seen, pose, []
     rows = np.concatenate([seen.which, which[kept]])
     pixels = np.concatenate([seen.pixels, further.corners_px[kept]])
-    sigma = np.concatenate([sigma, further.relative_sigma[kept]])
-    joined = _DetectedMarkers(seen.camera, table, rows, table.corners[rows], pixels, sigma)
+    errors = seen.errors.followed_by(further.errors.part(kept))
+    joined = _DetectedMarkers(seen.camera, table, rows, table.corners[rows], pixels, errors)
     refined = _refined(joined, pose)
     return (seen, pose, []) if refined is None else (joined, refined, kept)
 
 
-def _solutions(
-    seen: _DetectedMarkers, poses: list[PoseInCamera], floor_px: float, first: int
-) -> list[TargetPose]:
+def _without_wrong_sides(
+    seen: _DetectedMarkers, pose: PoseInCamera
+) -> tuple[_DetectedMarkers, PoseInCamera]:
+    """Return the markers with larger errors of sides that contradict the others, and their pose.
+
+    Such sides are fitted to something else, as the edge of a brighter face beside a narrow border.
+    """
+    for _ in range(_MOST_WRONG_SIDES):
+        square = _side_squares(seen, pose)
+        if not float(square.max()) > _WRONG_SIDE_SQUARE or square.size <= 4:
+            break
+        trials = []
+        for k in np.argsort(-square, kind="stable")[:_SUSPECTS].tolist():
+            weights = np.ones(square.size)
+            weights[k] = _WRONG_SIDE_WEIGHT
+            less = seen.errors.weighted(np.repeat(weights, 2).reshape(-1, 8))
+            trial = replace(seen, errors=less)
+            refined = _refined(trial, pose)
+            if refined is not None:
+                trials.append((float(_side_squares(trial, refined).sum()), trial, refined))
+        if not trials:
+            break
+        rss, better, refined = min(trials, key=lambda t: t[0])
+        noise = max(1.0, rss / (2.0 * square.size - 6.0))
+        if rss + _WRONG_SIDE_SQUARE * noise > float(square.sum()):
+            break
+        seen, pose = better, refined
+    return seen, pose
+
+
+def _side_squares(seen: _DetectedMarkers, pose: PoseInCamera) -> Array:
+    """Return the whitened squared error (4 n,) of each side; zero behind the camera."""
+    found = residual_of(seen.camera.matrix(), seen.points, seen.pixels, seen.errors.whitening, pose)
+    return (
+        np.zeros(4 * len(seen.which))
+        if found is None
+        else np.square(found[0]).reshape(-1, 2).sum(axis=1)
+    )
+
+
+def _solutions(seen: _DetectedMarkers, poses: list[PoseInCamera]) -> list[TargetPose]:
     """Return refined, distinct poses, best first; later ones are about as likely as the first.
 
-    The noise is that of the ``first`` markers if these tell it.
+    Errors are as large as stated, and as the residuals of the best pose tell: of the stated
+    variance's factor, which has an inverse gamma distribution of ``_PRIOR_RESIDUALS`` degrees of
+    freedom, the mean by them is taken.
     """
-    points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
-    sigma = np.repeat(seen.sigma, 4)
-    found: list[tuple[float, TargetPose]] = []
-    kept: list[Array] = []
+    found: list[tuple[float, Array, Array, PoseInCamera]] = []
     for number, pose in enumerate(poses):
         refined = pose if number == 0 else _refined(seen, pose)  # the first one is refined already
-        if refined is None or any(_angle(refined.rotation, other) < 1e-3 for other in kept):
+        if refined is None:
             continue
-        position, rotation = refined.position, refined.rotation
-        common = COMMON_PER_MARKER if len(seen.which) > 1 else 1.0
-        telling = 4 * first if first >= _TELLING_MARKERS else None
-        result = pose_covariance(
-            seen.camera, points, pixels, position, rotation, floor_px, sigma, common, telling
-        )
-        if result is None:
+        if any(_angle(refined.rotation, other.rotation) < 1e-3 for *_, other in found):
             continue
-        kept.append(rotation)
-        rms = reprojection_rms_px(seen.camera, points, pixels, position, rotation)
-        q = rotations.from_matrix(rotation)
-        found.append((result[1], TargetPose(position, q, result[0], rms)))
+        result = pose_covariance(seen.camera, seen.points, seen.pixels, seen.errors, refined)
+        if result is not None:
+            found.append((result[2], result[0], result[1], refined))
     if not found:
         return []
     found.sort(key=lambda item: item[0])
-    least = found[0][0]
-    variance = max(floor_px**2, least / (2 * len(points) - 6))
-    return [solution for rss, solution in found if (rss - least) / variance <= _AMBIGUITY_LIMIT]
+    least, free = found[0][0], 8 * len(seen.which) - 6
+    factor = max((_PRIOR_RESIDUALS + least) / (_PRIOR_RESIDUALS + free), _LEAST_FACTOR)
+    points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
+    return [
+        TargetPose(
+            pose.position,
+            rotations.from_matrix(pose.rotation),
+            factor * own + common,
+            reprojection_rms_px(seen.camera, points, pixels, pose.position, pose.rotation),
+        )
+        for rss, own, common, pose in found
+        if rss - least <= _AMBIGUITY_LIMIT * factor
+    ]
 
 
 def _one_of_each(which: list[int], error: list[float], gate_px: float) -> list[int]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refine a pose by Levenberg-Marquardt on the weighted reprojection error."""
+"""Refine a pose by Levenberg-Marquardt on the whitened reprojection error."""
 
 from __future__ import annotations
 
@@ -32,32 +32,34 @@ def rotation_matrix(rotation_vector: object) -> Array:
 
 
 def residual_of(
-    matrix: Array, points: Array, pixels: Array, weight: Array, pose: PoseInCamera
+    matrix: Array, points: Array, pixels: Array, whitening: Array, pose: PoseInCamera
 ) -> tuple[Array, Array] | None:
-    """Return the weighted reprojection error (2n,) and its Jacobian (2n, 6); None behind the
-    camera.
+    """Return the whitened reprojection error (8n,) of n markers and its Jacobian (8n, 6); None
+    behind the camera.
 
     The Jacobian is by a rotation phi in camera axes, R_true = exp([phi]x) R, and by position.
-    ``matrix`` (3, 3) of the camera; ``points`` (n, 3) in TRF, metres; ``pixels`` (n, 2), ideal;
-    ``weight`` (2n,): of each coordinate.
+    ``matrix`` (3, 3) of the camera; ``points`` (n, 4, 3) in TRF, metres; ``pixels`` (n, 4, 2),
+    ideal; ``whitening`` (n, 8, 8): of the errors of a marker's corners.
     """
-    turned = points @ pose.rotation.T
+    turned = points.reshape(-1, 3) @ pose.rotation.T
     if not float(turned[:, 2].min()) + float(pose.position[2]) > 1e-6:
         return None
     # With rotated points, OpenCV's derivative by the rotation vector at zero is that by phi.
     projected, jacobian = cv2.projectPoints(turned, _ZERO, pose.position, matrix, None)
-    return (np.ravel(projected) - pixels.ravel()) * weight, jacobian[:, :6] * weight[:, None]
+    error = (np.ravel(projected) - pixels.ravel()).reshape(-1, 8, 1)
+    by = whitening @ jacobian[:, :6].reshape(-1, 8, 6)
+    return (whitening @ error).ravel(), by.reshape(-1, 6)
 
 
 def refine(
-    matrix: Array, points: Array, pixels: Array, weight: Array, pose: PoseInCamera
+    matrix: Array, points: Array, pixels: Array, whitening: Array, pose: PoseInCamera
 ) -> PoseInCamera | None:
-    """Return the pose of least weighted squared error near ``pose``; None behind the camera.
+    """Return the pose of least whitened squared error near ``pose``; None behind the camera.
 
     Arguments as for `residual_of`; implemented in native/pose.c.
     """
     lens = (c_double * 4)(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    given = [np.ascontiguousarray(a, dtype=float) for a in (points, pixels, weight)]
+    given = [np.ascontiguousarray(a, dtype=float) for a in (points, pixels, whitening)]
     out = np.empty(12)
     out[:3], out[3:] = pose.position, pose.rotation.ravel()
     refined = function("refine_pose", c_int64)(

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw the measured pose around the true one, with the errors that rendered images have.
 
-Markers count as seen if they are large enough, face the camera and lie in the image. Corner noise
-of ``SIGMA_PX`` then gives the covariance of the pose, as in ``pnp``, and the error is drawn from
-it. ``tests/missions/test_statistical.py`` compares both with rendered images. Where no marker is
-seen, ``[ranging]`` gives bearing, range and attitude.
+Markers count as seen if they are large enough, face the camera and lie in the image. The errors of
+the lines of their sides, as `corners` states them in rendered images, give the covariance of the
+pose, as in ``pnp``, and the error is drawn from it. ``tests/missions/test_statistical.py`` compares
+both with rendered images. Where no marker is seen, ``[ranging]`` gives bearing, range and attitude.
 """
 
 from __future__ import annotations
 
-from ctypes import c_double, c_int64
+from ctypes import Structure, byref, c_double, c_int64
 
 import numpy as np
 from chaserdock_models import rotations
@@ -23,29 +23,39 @@ from chaserdock_protocol.pose_image import decode_pose
 from chaserdock_protocol.scenario.ranging import Ranging
 from numpy.typing import ArrayLike, NDArray
 
+from .corners import SETTINGS
+from .detect import dictionary_of
 from .lens import strong_stretch
-from .native import function
+from .native import LIBRARY, function
 from .pipeline import PerceptionResult
 from .pnp import MIN_SINGLE_COSINE, MarkerTable, TargetPose
 
-SIGMA_PX = 0.042
-"""Standard deviation of the coordinates of a corner of a large marker, pixels."""
-SMALL_SIDE_PX = 25.0
-"""Side of a marker, px, below which the standard deviation of its corners grows inversely."""
-MIN_SIDE_PX = 14.0
-"""Least side of a marker that is detected, px."""
-MIN_COSINE = 0.3
-"""Least cosine of the viewing angle of a detected marker; above ``MIN_SINGLE_COSINE``, so that a
-single detected marker always gives a pose.
-"""
-_MARGIN_PX = 2.0
-"""Least distance of a detected marker from the border of the image, px: part of its white border
-must be in view. Larger: the target is lost sooner at the border of the image.
-"""
-_LIMITS = (c_double * 6)(
-    SIGMA_PX, SMALL_SIDE_PX, MIN_SIDE_PX, MIN_COSINE, MIN_SINGLE_COSINE, _MARGIN_PX
-)
-"""``MarkerLimits`` of native/statistical.c."""
+
+@LIBRARY.structure("MarkerLimits")
+class _MarkerLimits(Structure):
+    """Mirror `MarkerLimits` of native/statistical.c."""
+
+    _fields_ = [
+        (name, c_double) for name in (
+            # Standard deviation of the line fitted to a marker's side, px of the image, over the
+            # square root of the lines of pixels across it: of its place, and of the difference of
+            # its ends. Of both what small cells add, of 1 px, by the power -1.25 of their width.
+            # Most lines of pixels that are fitted.
+            "place_px", "slope_px", "fine_place_px", "fine_slope_px", "most_lines",
+            # Cells along a side; least width of one, px, and least cosine of the viewing angle of
+            # a marker that is read where others put it.
+            "cells", "least_cell_px", "least_cosine",
+            # Least side, px, and cosine of one that is found by itself; that of a single one.
+            "least_side_px", "least_cosine_found", "least_cosine_single",
+            # Least distance from the border of the image, px: part of the white border must be in
+            # view. Larger: the target is lost sooner at the border of the image.
+            "margin_px",
+        )
+    ]  # fmt: skip
+
+
+REPROJECTION_RMS_PX = 0.05
+"""Stated root of the mean squared distance of corners from the pose, px: a median of images."""
 _NOTHING = PerceptionResult((), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), ())
 
 
@@ -55,6 +65,11 @@ class StatisticalPerception:
     def __init__(self, camera: Camera, model: TargetModel, ranging: Ranging | None = None) -> None:
         self._camera, self._ranging = camera, ranging.errors() if ranging else None
         self._table = MarkerTable.of(model)
+        cells = dictionary_of(model.dictionary).markerSize + 2
+        self._limits = _MarkerLimits(
+            0.0625, 0.187, 0.6, 0.9, SETTINGS.columns,
+            cells, 1.2, 0.1, 14.0, 0.3, MIN_SINGLE_COSINE, 2.0,
+        )  # fmt: skip
         self._lens = (c_double * 6)(
             camera.fx_px,
             camera.fy_px,
@@ -90,7 +105,7 @@ class StatisticalPerception:
         imaged = self._imaged(pose) if self._camera.distorts else (None, None)
         count = function("measure_pose", c_int64)(
             self._lens,
-            _LIMITS,
+            byref(self._limits),
             *map(address, surface),
             c_int64(m),
             address(pose),
@@ -107,7 +122,7 @@ class StatisticalPerception:
             position + error[:3],
             rotations.multiply(q, rotations.exp(error[3:])),
             covariance,
-            SIGMA_PX,
+            REPROJECTION_RMS_PX,
         )
         used = seen != 0
         return PerceptionResult((found,), table.ids[used], self._camera.distort(px[used]), ())

@@ -45,8 +45,8 @@ class SightingNoise(NamedTuple):
     """Errors of sightings as ratios to the stated sigma."""
 
     white_ratio: float
-    """White noise that has, averaged over seconds, the same effect as the true errors, half of
-    which are correlated over about 0.5 s.
+    """White noise that has, averaged over seconds, the same effect as the true errors, which are
+    partly correlated over about 0.5 s.
     """
     view_ratio: float
     """Error that persists while the view stays the same."""
@@ -58,9 +58,9 @@ class SightingNoise(NamedTuple):
     """
 
 
-SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.22, view_time_s=25.0)
-SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
-"""Sightings of several small markers, whose corners depend more on the pixel grid."""
+SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.3, view_time_s=25.0)
+SEVERAL_MARKERS = SightingNoise(white_ratio=1.0, view_ratio=0.25, view_time_s=3.0)
+"""Sightings of several markers, whose errors differ: those of the view are averaged."""
 SHAPE = SightingNoise(white_ratio=1.0, view_ratio=1.6, view_time_s=30.0, units_time_s=15.0)
 """Sightings by shape: errors of geometry and shading change only with the view and are alike in the
 images of several cameras (docs/markerless.md).

@@ -39,14 +39,20 @@ typedef struct {
      * the outer edge of a border is fitted; prior of the logarithm of the edge's sigma; rounds and
      * iterations per round. See corners.py for each. */
     double columns, end_px, end_share, reach_px, clear_px, beyond_px, strip_px, partial_px,
-        least_fall, agreement_px;
-    double log_edge_sigma, edge_sigma_spread, rounds, iterations, strip_iterations;
-    double uncertain_px, uncertain_level;
+        least_fall, agreement_px, agreement_sigmas;
+    double log_edge_sigma, edge_sigma_spread, fade_spread, alike_columns, rounds, iterations,
+        strip_iterations;
+    /* What noise does not explain of a line's place; see corners.py for each. */
+    double least_sigma_px, aligned_sigma_px, fine_sigma_px, border_sigma_px, outer_sigma_px,
+        cut_sigma_px, cut_spread_px, common_share, free_blur, blur_sigma_px, adjoining_sigma_px;
 } Settings;
 LAYOUT(Settings, reach_cells, reach_least_px, min_contrast, min_rows_share, max_move_px, first,
        last, rows, taps, coarse_reach_px, border_share, columns, end_px, end_share, reach_px,
-       clear_px, beyond_px, strip_px, partial_px, least_fall, agreement_px, log_edge_sigma,
-       edge_sigma_spread, rounds, iterations, strip_iterations, uncertain_px, uncertain_level)
+       clear_px, beyond_px, strip_px, partial_px, least_fall, agreement_px, agreement_sigmas,
+       log_edge_sigma, edge_sigma_spread, fade_spread, alike_columns, rounds, iterations,
+       strip_iterations, least_sigma_px, aligned_sigma_px, fine_sigma_px, border_sigma_px,
+       outer_sigma_px, cut_sigma_px, cut_spread_px, common_share, free_blur, blur_sigma_px,
+       adjoining_sigma_px)
 
 typedef struct {
     double start[2], vector[2], normal[2], extent;
@@ -375,59 +381,123 @@ static int solve_normal(double *a, double *b, int n) {
     return solve_rows(a, b, n);
 }
 
+/* A line fitted to a side: outward offsets of its two ends, pixels, and their covariance (start;
+ * both; end), without the `common` error, outwards, standard deviation, that all lines of an image
+ * share; rise and fall at the side and at its border's outer edge, grey levels; logarithm of the
+ * blur. `columns` that tell of correlated pixels, and `alike`, the sum over them of the variance of
+ * a column over that of independent pixels. `width` of the border, pixels; whether its `outer` edge
+ * is fitted, only so (`narrow`), and `cut` by neighbours. */
+typedef struct {
+    double ends[2], covariance[3], common, rise, fall, log_sigma, columns, alike, width;
+    int outer, narrow, cut;
+} Line;
+
+/* Places across an edge, half a sigma of its blur each, whose mean residuals are no noise but the
+ * shape of the blur. */
+#define SHAPE 16
+/* Unknowns of a side at most: black, rise, fall; offset, slope, light, blur. */
+#define UNKNOWNS 7
+
+/* Covariance of a line's ends from the normal equations (n, n) of all unknowns, of which its offset
+ * and slope are those from `first` on, and the variance of a pixel. */
+static int line_covariance(const double *normal, int n, int first, double variance, Line *line) {
+    double block[3];
+    for (int k = 0; k < 2; k++) {
+        double a[UNKNOWNS * UNKNOWNS], b[UNKNOWNS] = {0.0};
+        copy(normal, a, n * n);
+        b[first + k] = 1.0;
+        if (!solve_normal(a, b, n)) return 0;
+        block[k] = b[first], block[2] = b[first + 1];
+    }
+    line->covariance[0] = variance * (block[0] - block[1] + 0.25 * block[2]);
+    line->covariance[1] = variance * (block[0] - 0.25 * block[2]);
+    line->covariance[2] = variance * (block[0] + block[1] + 0.25 * block[2]);
+    return 1;
+}
+
 /* Fits a side's line to the grey levels of its pixels, with a border `outer` of known width or
- * none: black + rise Phi((s - e) / sigma) + fall Phi((s - e - border) / sigma), where e = offset +
- * slope * along. The levels are by least squares, sigma has a prior. Columns that do not fit, as
- * where something hides the side, are left out. Writes the outward offsets of the line's two ends,
- * pixels, and the rise and the fall in grey levels; returns whether the side is usable. */
-static inline __attribute__((always_inline)) int fit_band_of(
-    const Settings *set, const Edge *edge, Band *band, int outer, int iterations,
-    double *ends, double *change) {
-    double offset = 0.0, slope = 0.0, log_sigma = set->log_edge_sigma, weight[COLUMNS_MOST],
-           levels[3] = {0.0};
+ * none: light (black + rise Phi((s - e) / sigma) + fall Phi((s - e - border) / sigma)), where e =
+ * offset + slope * along and light = 1 + fade * along. The levels are by least squares, sigma and
+ * fade have priors. Columns that do not fit, as where something hides the side, are left out.
+ * Returns whether the side is usable. */
+static inline __attribute__((always_inline)) int fit_band_of(const Settings *set, const Edge *edge,
+                                                             Band *band, int outer, int iterations,
+                                                             Line *line) {
+    double offset = 0.0, slope = 0.0, fade = 0.0, log_sigma = set->log_edge_sigma;
+    double weight[COLUMNS_MOST], levels[3] = {0.0}, normal[UNKNOWNS * UNKNOWNS];
+    double variance = 0.0;
     /* An assumed error of 2 grey levels sets the weight of the prior of sigma. */
     double prior = (2.0 / set->edge_sigma_spread) * (2.0 / set->edge_sigma_spread);
-    int count = outer ? 3 : 2, n = count + 3;
+    double even = (2.0 / set->fade_spread) * (2.0 / set->fade_spread);
+    int count = outer ? 3 : 2, n = count + 4;
     copy(band->inside, weight, band->columns);
     for (int step = 0; step < iterations; step++) {
-        double sigma = exponential(log_sigma), a[36] = {0.0}, b[6] = {0.0}, row[6] = {1.0};
+        double sigma = exponential(log_sigma), a[UNKNOWNS * UNKNOWNS] = {0.0}, b[UNKNOWNS] = {0.0};
+        double row[UNKNOWNS] = {0.0}, scaled[3];
         for (int i = 0; i < band->count; i++) {
             double s = band->offset[i] - (offset + slope * band->along[i]);
+            double light = 1.0 + fade * band->along[i];
+            scaled[0] = light;
             for (int k = 0; k < count - 1; k++) {
                 double z = (k ? s - band->border[i] : s) / sigma;
-                edge_at(edge, z, row + 1 + k, band->density[k] + i);
+                edge_at(edge, z, band->distribution[k] + i, band->density[k] + i);
                 band->z[k][i] = z;
-                band->distribution[k][i] = row[1 + k];
+                scaled[1 + k] = light * band->distribution[k][i];
             }
-            add_row(row, band->level[i], weight[band->column[i]], count, a, b);
+            add_row(scaled, band->level[i], weight[band->column[i]], count, a, b);
         }
         if (!solve_normal(a, b, count)) return 0;
         copy(b, levels, count);
         double square[COLUMNS_MOST] = {0.0}, pixels[COLUMNS_MOST] = {0.0};
-        zero(a, 36);
-        zero(b, 6);
+        double score[COLUMNS_MOST] = {0.0}, expected = 0.0;
+        double shape[2 * SHAPE] = {0.0}, *at_shape = shape + SHAPE;
+        zero(a, UNKNOWNS * UNKNOWNS);
+        zero(b, UNKNOWNS);
         for (int i = 0; i < band->count; i++) {
-            double z[2] = {0.0}, density[2] = {0.0}, residual = band->level[i] - levels[0];
+            double z[2] = {0.0}, density[2] = {0.0}, light = 1.0 + fade * band->along[i];
+            double model = levels[0];
+            row[0] = light;
             for (int k = 0; k < count - 1; k++) {
                 z[k] = band->z[k][i];
                 density[k] = band->density[k][i];
-                row[1 + k] = band->distribution[k][i];
-                residual -= levels[1 + k] * row[1 + k];
+                row[1 + k] = light * band->distribution[k][i];
+                model += levels[1 + k] * band->distribution[k][i];
             }
-            double rise = levels[1] * density[0], fall = levels[2] * density[1];
+            double rise = light * levels[1] * density[0], fall = light * levels[2] * density[1];
+            double residual = band->level[i] - light * model;
             row[count] = -(rise + fall) / sigma;
             row[count + 1] = row[count] * band->along[i];
-            row[count + 2] = -(rise * z[0] + fall * z[1]);
+            row[count + 2] = model * band->along[i];
+            row[count + 3] = -(rise * z[0] + fall * z[1]);
             add_row(row, residual, weight[band->column[i]], n, a, b);
             square[band->column[i]] += residual * residual;
             pixels[band->column[i]] += 1.0;
+            int place = (int)min_of(max_of(2.0 * z[0] + 0.5 * SHAPE, 0.0), SHAPE - 1.0);
+            score[band->column[i]] += weight[band->column[i]] * residual * row[count];
+            expected += weight[band->column[i]] * row[count] * row[count];
+            shape[place] += weight[band->column[i]] * residual;
+            at_shape[place] += weight[band->column[i]];
         }
+        double sum = 0.0, used = 0.0, scores = 0.0, columns = 0.0;
+        for (int c = 0; c < band->columns; c++) {
+            sum += weight[c] * square[c], used += weight[c] * pixels[c];
+            scores += score[c] * score[c], columns += weight[c];
+        }
+        for (int k = 0; k < SHAPE; k++)
+            if (at_shape[k] > 0.0) sum -= shape[k] * shape[k] / at_shape[k], used -= 1.0;
+        variance = max_of(sum, 0.0) / max_of(used - n, 1.0);
+        line->columns = max_of(columns - 2.0, 0.0); /* two are lost to offset and slope */
+        line->alike = columns * scores / max_of(expected * variance, 1e-9);
+        a[(n + 1) * (n - 2)] += even;
+        b[n - 2] -= even * fade;
         a[n * n - 1] += prior;
         b[n - 1] += prior * (set->log_edge_sigma - log_sigma);
+        copy(a, normal, n * n);
         if (!solve_normal(a, b, n)) return 0;
         offset = limited(offset + limited(b[count], 1.0), 2.0);
         slope = limited(slope + limited(b[count + 1], 2.0), 4.0);
-        log_sigma += limited(b[count + 2], 0.2);
+        fade = limited(fade + limited(b[count + 2], 0.1), 0.5);
+        log_sigma += limited(b[count + 3], 0.2);
         for (int c = 0; c < band->columns; c++) square[c] /= max_of(pixels[c], 1.0);
         double limit = 9.0 * median_of(square, band->inside, band->columns) + 4.0;
         for (int c = 0; c < band->columns; c++)
@@ -435,72 +505,132 @@ static inline __attribute__((always_inline)) int fit_band_of(
     }
     double used = 0.0;
     for (int c = 0; c < band->columns; c++) used += weight[c];
-    ends[0] = offset - 0.5 * slope;
-    ends[1] = offset + 0.5 * slope;
-    change[0] = levels[1];
-    change[1] = -levels[2];
+    line->ends[0] = offset - 0.5 * slope;
+    line->ends[1] = offset + 0.5 * slope;
+    line->rise = levels[1];
+    line->fall = -levels[2];
+    line->log_sigma = log_sigma;
     return levels[1] >= set->min_contrast && used >= set->min_rows_share * band->columns &&
-           finite(ends[0]) && finite(ends[1]);
+           finite(line->ends[0]) && finite(line->ends[1]) &&
+           line_covariance(normal, n, count, variance, line);
 }
 
 /* `fit_band_of` in two copies, whose sizes the compiler knows. */
-static int fit_band(const Settings *set, const Edge *edge, Band *band, int outer,
-                    int iterations, double *ends, double *change) {
-    return outer ? fit_band_of(set, edge, band, 1, iterations, ends, change)
-                 : fit_band_of(set, edge, band, 0, iterations, ends, change);
+static int fit_band(const Settings *set, const Edge *edge, Band *band, int outer, int iterations,
+                    Line *line) {
+    return outer ? fit_band_of(set, edge, band, 1, iterations, line)
+                 : fit_band_of(set, edge, band, 0, iterations, line);
 }
 
-/* Fits a side's line and its contrast, grey levels. The outer edge of a border, used in the last
- * round if `outlined`, must be a fall in brightness and agree with the side itself: otherwise
- * another face adjoins it. A border that ends at neighbours beside parts of the side only is not
- * fitted with its outer edge, as long as enough of it is clear. */
+/* Scales the covariances of a marker's lines by what their columns tell: compression correlates
+ * pixels, so that columns scatter more or less than those of independent pixels. */
+static void scale_noise(const Settings *set, Line *lines) {
+    double columns = set->alike_columns, alike = set->alike_columns;
+    for (int i = 0; i < 4; i++) columns += lines[i].columns, alike += lines[i].alike;
+    for (int i = 0; i < 4; i++)
+        for (int k = 0; k < 3; k++) lines[i].covariance[k] *= alike / columns;
+}
+
+/* Adds to a line's covariance what the noise of pixels does not explain: width of a `cell` across
+ * the side, and of the `finest` cell of the marker, pixels. */
+static void add_model_error(const Settings *set, const Side *side, double cell, double finest,
+                            Line *line) {
+    double fine = set->fine_sigma_px / (cell * finest);
+    double border = (line->outer ? set->outer_sigma_px : set->border_sigma_px) /
+                    (line->width * line->width);
+    double crossed = min_of(abs_of(side->vector[0]), abs_of(side->vector[1]));
+    double aligned = set->aligned_sigma_px / (1.0 + 2.0 * crossed);
+    double at_end = 2.0 * (set->least_sigma_px * set->least_sigma_px + aligned * aligned);
+    double blur = line->log_sigma - set->log_edge_sigma;
+    double unlike = max_of(abs_of(blur) - set->free_blur, 0.0) * set->blur_sigma_px;
+    double adjoining = max_of(blur - set->free_blur, 0.0) * set->adjoining_sigma_px;
+    double whole = fine * fine + border * border + unlike * unlike;
+    if (line->narrow) whole += adjoining * adjoining;
+    double common = set->common_share * whole;
+    whole -= common;
+    if (line->cut) {
+        common += set->cut_sigma_px * set->cut_sigma_px;
+        whole += set->cut_spread_px * set->cut_spread_px;
+    }
+    line->common = sqrt_of(common);
+    line->covariance[0] += whole + at_end;
+    line->covariance[1] += whole;
+    line->covariance[2] += whole + at_end;
+}
+
+/* Fits a side's line. The outer edge of a border, used in the last round if `outlined`, must be a
+ * fall in brightness and agree with the side itself: otherwise another face adjoins it. A border
+ * that ends at neighbours beside parts of the side only is not fitted with its outer edge, as long
+ * as enough of it is clear. */
 static int fit_side(const Image *p, const Settings *set, const Edge *edge, const Side *side,
                     const Border *border, int outlined, int last, double inner, Band *band,
-                    double *at_start, double *at_end, double *contrast) {
-    double width = border->at + 0.5 * border->rise * side->extent, ends[2] = {0.0}, both[2],
-           change[2];
-    int fine = 0, narrow = width < (outlined ? set->strip_px : set->partial_px);
+                    Line *line) {
+    double width = border->at + 0.5 * border->rise * side->extent;
+    int fine = 0, outer = 0, narrow = width < (outlined ? set->strip_px : set->partial_px);
     if (!narrow) {
         collect(p, set, side, border, 0, inner, band);
-        fine = fit_band(set, edge, band, 0, (int)set->iterations, ends, change);
+        fine = fit_band(set, edge, band, 0, (int)set->iterations, line);
     }
     if (narrow || (fine && outlined && last)) {
+        Line both;
         collect(p, set, side, border, 1, inner, band);
         int fits = fit_band(set, edge, band, 1,
-                            (int)(narrow ? set->strip_iterations : set->iterations), both, change);
+                            (int)(narrow ? set->strip_iterations : set->iterations), &both);
         if (narrow) fine = fits;
-        else
-            fits = fits && change[1] >= set->least_fall * change[0] &&
-                   abs_of(both[0] - ends[0]) < set->agreement_px &&
-                   abs_of(both[1] - ends[1]) < set->agreement_px;
-        if (fits) copy(both, ends, 2);
+        else fits = fits && both.fall >= set->least_fall * both.rise;
+        for (int k = 0; k < 2 && fits && !narrow; k++) {
+            double sigma = sqrt_of(line->covariance[2 * k]);
+            double limit = min_of(set->agreement_px, set->agreement_sigmas * sigma);
+            fits = abs_of(both.ends[k] - line->ends[k]) < limit;
+        }
+        if (fits) *line = both, outer = 1;
     }
-    *at_start = ends[0];
-    *at_end = ends[1];
-    *contrast = change[0];
+    line->width = max_of(width, 0.5);
+    line->outer = outer, line->narrow = narrow, line->cut = narrow && !outlined;
     return fine;
 }
 
-/* Refines corners (n, 4, 2) in place, in the frame (n, 3, 3) of a marker if it is `framed` (n), else
- * in ideal pixels. `lens`: null without distortion. `good` (n): whether all four sides are usable;
- * otherwise the corners are unchanged, as for corners that are not finite. `sigma` (n): uncertainty
- * relative to that of a large marker. `margin` (n): width of the white border over the marker's
- * side; `outlined` (n): whether it ends there on all sides. `cells`: cells along a side, including
- * the black border. */
+/* Writes the matrix (8, 8) that turns errors of a marker's corners into independent ones of unit
+ * variance: those of the lines of its sides, by the covariance of their ends; and what the `common`
+ * error (8) is by that. Returns whether both are finite. */
+static int whiten(const Side *sides, const Line *lines, double *whitening, double *common) {
+    zero(whitening, 64);
+    for (int i = 0; i < 4; i++) {
+        const double *c = lines[i].covariance, *normal = sides[i].normal;
+        double first = sqrt_of(c[0]), cross = c[1] / first, second = sqrt_of(c[2] - cross * cross);
+        int at[2] = {2 * i, 2 * ((i + 1) % 4)};
+        for (int k = 0; k < 2; k++) {
+            whitening[8 * (2 * i) + at[0] + k] = normal[k] / first;
+            whitening[8 * (2 * i + 1) + at[0] + k] = -normal[k] * cross / (first * second);
+            whitening[8 * (2 * i + 1) + at[1] + k] = normal[k] / second;
+        }
+        common[2 * i] = lines[i].common / first;
+        common[2 * i + 1] = lines[i].common * (1.0 - cross / first) / second;
+    }
+    return all_finite(whitening, 64) && all_finite(common, 8);
+}
+
+/* Refines corners (n, 4, 2) in place, in the frame (n, 3, 3) of a marker if it is `framed` (n),
+ * else in ideal pixels. `lens`: null without distortion. `good` (n): whether all four sides are
+ * usable; otherwise the corners are unchanged, as for corners that are not finite. `whitening`
+ * (n, 8, 8) and `common` (n, 8): of the errors of good corners, as `whiten`. `margin` (n): width of
+ * the white border over the marker's side; `outlined` (n): whether it ends there on all sides.
+ * `cells`: cells along a side, including the black border. */
 EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t width,
                                  const double *camera, const Lens *lens, const double *frames,
                                  const uint8_t *framed, const Settings *set, double cells,
                                  int64_t n, const double *margin, const uint8_t *outlined,
-                                 double *corners, uint8_t *good, double *sigma) {
+                                 double *corners, uint8_t *good, double *whitening,
+                                 double *common) {
     Image p = {image, height, width, camera, lens, NULL};
     Edge edge;
     Band band;
     tabulate(&edge);
     for (int64_t m = 0; m < n; m++) {
-        double *given = corners + 8 * m, refined[8], at_start[4], at_end[4],
-               contrast[4] = {1.0, 1.0, 1.0, 1.0};
+        double *given = corners + 8 * m, refined[8], at_start[4], at_end[4];
         Side sides[4];
         Border borders[4];
+        Line lines[4];
         int fine = 1;
         p.frame = framed[m] ? frames + 9 * m : NULL;
         copy(given, refined, 8);
@@ -515,20 +645,21 @@ EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t w
             for (int i = 0; i < 4 && fine; i++) {
                 double inner = reach_of(set, sides + i, cells, set->reach_px);
                 fine = fit_side(&p, set, &edge, sides + i, borders + i, outlined[m], last, inner,
-                                &band, at_start + i, at_end + i, contrast + i);
+                                &band, lines + i);
+                at_start[i] = lines[i].ends[0], at_end[i] = lines[i].ends[1];
             }
             fine = fine && crossings(sides, at_start, at_end, refined);
         }
         for (int i = 0; i < 8; i++) fine &= abs_of(refined[i] - given[i]) < set->max_move_px;
-        if (!fine) copy(given, refined, 8);
-        sides_of(refined, sides);
-        double finest = sides[0].extent, least = contrast[0];
-        for (int i = 1; i < 4; i++)
-            finest = min_of(finest, sides[i].extent), least = min_of(least, contrast[i]);
-        double blur = set->uncertain_px / max_of(finest * min_of(margin[m], 1.0 / cells), 0.1);
-        double noise = set->uncertain_level / max_of(least, 1.0);
-        sigma[m] = sqrt_of((1.0 + blur * blur) + noise * noise);
-        copy(refined, given, 8);
+        double finest = 1e300;
+        for (int i = 0; i < 4; i++) finest = min_of(finest, sides[i].extent / cells);
+        if (fine) {
+            scale_noise(set, lines);
+            for (int i = 0; i < 4; i++)
+                add_model_error(set, sides + i, sides[i].extent / cells, finest, lines + i);
+        }
+        fine = fine && whiten(sides, lines, whitening + 64 * m, common + 8 * m);
+        if (fine) copy(refined, given, 8);
         good[m] = (uint8_t)fine;
     }
 }

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Pose of minimum weighted reprojection error: Levenberg-Marquardt. */
+/* Pose of minimum whitened reprojection error: Levenberg-Marquardt. */
 #include "base.h"
 
 /* Share of the squared error below which a step's gain ends the iteration: with 32 coordinates, a
@@ -13,36 +13,41 @@ typedef struct {
     double cost, gradient[6], information[36];
 } Normal;
 
-/* Compute squared weighted error, gradient and Gauss-Newton matrix of a pose (position (3),
+/* Compute squared whitened error, gradient and Gauss-Newton matrix of a pose (position (3),
  * rotation (3, 3)) by a rotation phi in camera axes, R_true = exp([phi]x) R, and by position;
  * return 0 for points behind the camera. */
 static int normal_of(const double *lens, const double *points, const double *pixels,
-                     const double *weight, int64_t n, const double *pose, Normal *out) {
+                     const double *whitening, int64_t n, const double *pose, Normal *out) {
     out->cost = 0.0;
     zero(out->gradient, 6);
     zero(out->information, 36);
-    for (int64_t i = 0; i < n; i++) {
-        double turned[3], row[2][6], residual[2];
-        multiply3(pose + 3, points + 3 * i, turned);
-        double x = turned[0] + pose[0], y = turned[1] + pose[1], z = turned[2] + pose[2];
-        if (!(z > 1e-6)) return 0;
-        double u = x / z, v = y / z;
-        double by[2][3] = {{lens[0] / z, 0.0, -lens[0] * u / z},
-                           {0.0, lens[1] / z, -lens[1] * v / z}};
-        residual[0] = lens[0] * u + lens[2] - pixels[2 * i];
-        residual[1] = lens[1] * v + lens[3] - pixels[2 * i + 1];
-        for (int k = 0; k < 2; k++) {
-            double w = weight[2 * i + k];
-            cross3(turned, by[k], row[k]);
-            for (int j = 0; j < 3; j++) row[k][3 + j] = by[k][j];
-            for (int j = 0; j < 6; j++) row[k][j] *= w;
-            residual[k] *= w;
-            out->cost += residual[k] * residual[k];
+    for (int64_t m = 0; m < n; m++) {
+        double row[8][7]; /* derivatives and residual of each coordinate */
+        for (int c = 0; c < 4; c++) {
+            double turned[3];
+            multiply3(pose + 3, points + 12 * m + 3 * c, turned);
+            double x = turned[0] + pose[0], y = turned[1] + pose[1], z = turned[2] + pose[2];
+            if (!(z > 1e-6)) return 0;
+            double u = x / z, v = y / z;
+            double by[2][3] = {{lens[0] / z, 0.0, -lens[0] * u / z},
+                               {0.0, lens[1] / z, -lens[1] * v / z}};
+            row[2 * c][6] = lens[0] * u + lens[2] - pixels[8 * m + 2 * c];
+            row[2 * c + 1][6] = lens[1] * v + lens[3] - pixels[8 * m + 2 * c + 1];
+            for (int k = 0; k < 2; k++) {
+                cross3(turned, by[k], row[2 * c + k]);
+                for (int j = 0; j < 3; j++) row[2 * c + k][3 + j] = by[k][j];
+            }
         }
-        for (int a = 0; a < 6; a++) {
-            out->gradient[a] += row[0][a] * residual[0] + row[1][a] * residual[1];
-            for (int b = 0; b <= a; b++)
-                out->information[6 * a + b] += row[0][a] * row[0][b] + row[1][a] * row[1][b];
+        for (int i = 0; i < 8; i++) {
+            const double *w = whitening + 64 * m + 8 * i;
+            double white[7] = {0.0};
+            for (int k = 0; k < 8; k++)
+                for (int j = 0; j < 7; j++) white[j] += w[k] * row[k][j];
+            out->cost += white[6] * white[6];
+            for (int a = 0; a < 6; a++) {
+                out->gradient[a] += white[a] * white[6];
+                for (int b = 0; b <= a; b++) out->information[6 * a + b] += white[a] * white[b];
+            }
         }
     }
     for (int a = 0; a < 6; a++)
@@ -68,12 +73,12 @@ static void turned_by(const double *phi, const double *rotation, double *out) {
 }
 
 /* Move ``pose`` (position (3), rotation (3, 3), TRF to IRF) to the nearest minimum; return 0 if
- * there is none of finite numbers. ``lens``: fx, fy, cx, cy; ``points`` (n, 3) TRF, ``pixels`` (n,
- * 2) ideal, ``weight`` (n, 2). */
+ * there is none of finite numbers. ``lens``: fx, fy, cx, cy; of n markers ``points`` (n, 4, 3) TRF,
+ * ``pixels`` (n, 4, 2) ideal, ``whitening`` (n, 8, 8): of the errors of their coordinates. */
 EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const double *pixels,
-                                 const double *weight, int64_t n, double *pose) {
+                                 const double *whitening, int64_t n, double *pose) {
     Normal now, then;
-    if (!normal_of(lens, points, pixels, weight, n, pose, &now) || !finite(now.cost)) return 0;
+    if (!normal_of(lens, points, pixels, whitening, n, pose, &now) || !finite(now.cost)) return 0;
     double damping = 1e-7;
     for (int iteration = 0; iteration < 20; iteration++) {
         double matrix[36], step[6], trial[12], predicted = 0.0;
@@ -92,7 +97,7 @@ EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const
             copy(trial, pose, 12);
             break;
         }
-        if (normal_of(lens, points, pixels, weight, n, trial, &then) && then.cost <= now.cost) {
+        if (normal_of(lens, points, pixels, whitening, n, trial, &then) && then.cost <= now.cost) {
             double gain = now.cost - then.cost;
             copy(trial, pose, 12);
             now = then;

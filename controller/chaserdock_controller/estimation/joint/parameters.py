@@ -354,17 +354,10 @@ def _target_noise(estimator: EstimatorSection) -> dict[str, tuple[float, float]]
 
 
 def _of_drawn(parameters: JointParameters) -> JointParameters:
-    """Return the parameters for sightings that are drawn with the stated covariance, which is
-    never singular.
+    """Return the parameters for sightings that are drawn with the stated covariance. The floor
+    stays: it covers what no covariance states, such as errors of exposure times.
     """
-    return replace(
-        parameters,
-        single_marker=DRAWN,
-        several_markers=DRAWN,
-        shape=DRAWN,
-        floor_sighting_m=0.0,
-        floor_sighting_rad=0.0,
-    )
+    return replace(parameters, single_marker=DRAWN, several_markers=DRAWN, shape=DRAWN)
 
 
 def rows_of(matrix: Array) -> Matrix9:

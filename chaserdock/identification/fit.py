@@ -22,8 +22,8 @@ from .motion_filter import (
     Commanded,
     MotionFilter,
     Noise,
-    Parameters,
     Pass,
+    RobotParameters,
     actuation_of,
     commanded_over,
 )
@@ -70,7 +70,7 @@ _FIT = FitParameters()
 
 
 @dataclass(frozen=True)
-class Quantity:
+class IdentifiedQuantity:
     """One identified value in SI units. ``stated``: by the scenario. ``known``: whether the run
     tells it; if not, ``value`` has no meaning.
     """
@@ -89,7 +89,7 @@ class Quantity:
 
 
 @dataclass(frozen=True, eq=False)
-class Identification:
+class RobotIdentification:
     """What a run tells of a robot.
 
     ``values`` (Q,), ``covariance`` (Q, Q) of ``quantities``. ``noise_ratio``: measured noise of the
@@ -100,13 +100,13 @@ class Identification:
     robot: RecordedRobot
     mass_kg: float
     weighed: bool
-    quantities: tuple[Quantity, ...]
+    quantities: tuple[IdentifiedQuantity, ...]
     covariance: Array
     scatter_share: float
     noise_ratio: tuple[float, ...]
     correlation: float
 
-    def named(self, prefix: str) -> list[Quantity]:
+    def named(self, prefix: str) -> list[IdentifiedQuantity]:
         """Return the quantities whose names begin with ``prefix``."""
         return [q for q in self.quantities if q.name.startswith(prefix)]
 
@@ -116,7 +116,9 @@ class Identification:
         return abs(self.correlation) > _FIT.correlated
 
 
-def identify(source: str | Path, chaser: int = 0, mass_kg: float | None = None) -> Identification:
+def identify(
+    source: str | Path, chaser: int = 0, mass_kg: float | None = None
+) -> RobotIdentification:
     """Identify the robot of a chaser from the log of a run.
 
     ``mass_kg``: as weighed. Without it, thrusts are right on average, or with ideal actuators
@@ -125,7 +127,7 @@ def identify(source: str | Path, chaser: int = 0, mass_kg: float | None = None) 
     return identify_robot(recorded_robot(source, chaser), mass_kg)
 
 
-def identify_robot(robot: RecordedRobot, mass_kg: float | None = None) -> Identification:
+def identify_robot(robot: RecordedRobot, mass_kg: float | None = None) -> RobotIdentification:
     """Identify a robot from what a log knows of it. ``mass_kg``: see ``identify``."""
     body = robot.scenario.chaser
     actuation = actuation_of(body)
@@ -137,7 +139,7 @@ def identify_robot(robot: RecordedRobot, mass_kg: float | None = None) -> Identi
     stated = np.diag(robot.motion.noise).reshape(4, 3).mean(axis=1)
     shown = np.diag(noise.measured).reshape(4, 3).mean(axis=1)
     ratio = np.sqrt(np.divide(shown, stated, out=np.full(4, np.nan), where=stated > 0.0))
-    return Identification(
+    return RobotIdentification(
         robot,
         float(values[0]),
         mass_kg is not None,
@@ -156,7 +158,7 @@ class _Fit:
         self._robot, self._actuation, self._mass_kg = robot, actuation, mass_kg
         body, errors = robot.scenario.chaser, robot.scenario.navigation.errors()
         moments = np.array(body.inertia)
-        self._nominal = Parameters(
+        self._nominal = RobotParameters(
             actuation.nominal,
             np.zeros(3),
             np.array([*moments, 0.0, 0.0, 0.0]),
@@ -174,7 +176,7 @@ class _Fit:
         self._noise = Noise(robot.motion.noise + np.diag(floors**2), wander, 0.0)
         self._commanded: tuple[float, Commanded] | None = None
 
-    def converged(self) -> tuple[Parameters, Pass, Noise]:
+    def converged(self) -> tuple[RobotParameters, Pass, Noise]:
         """Return the likeliest parameters, the last pass, and the noise."""
         parameters, found = self._iterated(self._with_best_delay())
         while (likelier := self._with_best_scatter(parameters)) != self._noise.scatter_share:
@@ -182,11 +184,11 @@ class _Fit:
             parameters, found = self._iterated(parameters)
         return parameters, found, self._noise
 
-    def _with_best_delay(self) -> Parameters:
+    def _with_best_delay(self) -> RobotParameters:
         tries = [replace(self._nominal, delay_s=delay) for delay in _FIT.delays_s]
         return max(tries, key=lambda p: self._run(p, self._noise).log_likelihood)
 
-    def _with_best_scatter(self, parameters: Parameters) -> float:
+    def _with_best_scatter(self, parameters: RobotParameters) -> float:
         """Return the likeliest scatter, not below the present one: noise that it explains now is
         not the odometry's any more.
         """
@@ -195,7 +197,7 @@ class _Fit:
         likelihoods = [self._run(parameters, noise).log_likelihood for noise in noises]
         return tries[int(np.argmax(likelihoods))]
 
-    def _iterated(self, parameters: Parameters) -> tuple[Parameters, Pass]:
+    def _iterated(self, parameters: RobotParameters) -> tuple[RobotParameters, Pass]:
         for _ in range(_FIT.passes):
             found = self._run(parameters, self._noise)
             parameters = _moved(parameters, found.change)
@@ -206,14 +208,14 @@ class _Fit:
                 break
         return parameters, self._run(parameters, self._noise)
 
-    def _noise_about(self, parameters: Parameters) -> Noise:
+    def _noise_about(self, parameters: RobotParameters) -> Noise:
         """Return the noise that the residuals about known parameters show."""
         run = MotionFilter(self._actuation, self._mass_kg, parameters, self._noise).run
         none = np.zeros(len(self._prior))
         found = run(self._robot.motion, self._commanded_by(parameters.delay_s), none, none)
         return replace(self._noise, measured=self._positive(found.measured))
 
-    def _run(self, parameters: Parameters, noise: Noise) -> Pass:
+    def _run(self, parameters: RobotParameters, noise: Noise) -> Pass:
         start = self._nominal.vector - parameters.vector
         run = MotionFilter(self._actuation, self._mass_kg, parameters, noise).run
         return run(self._robot.motion, self._commanded_by(parameters.delay_s), start, self._prior)
@@ -250,14 +252,14 @@ def _prior(
     )
 
 
-def _moved(parameters: Parameters, change: Array) -> Parameters:
+def _moved(parameters: RobotParameters, change: Array) -> RobotParameters:
     """Return the parameters after a step, shortened until a body can have the inertia: far from the
     solution a step goes too far.
     """
     least = np.linalg.eigvalsh(parameters.tensor)[0] * _FIT.kept_inertia
-    while np.linalg.eigvalsh(Parameters.of(parameters.vector + change).tensor)[0] < least:
+    while np.linalg.eigvalsh(RobotParameters.of(parameters.vector + change).tensor)[0] < least:
         change = change / 2.0
-    return Parameters.of(parameters.vector + change)
+    return RobotParameters.of(parameters.vector + change)
 
 
 def _sigmas(covariance: Array) -> Array:
@@ -268,7 +270,7 @@ def _scaled(
     robot: RecordedRobot,
     actuation: Actuation,
     mass_kg: float,
-    parameters: Parameters,
+    parameters: RobotParameters,
     found: Pass,
     weighed: bool,
 ) -> tuple[Array, Array]:
@@ -300,7 +302,7 @@ def _scaled(
 
 def _quantities(
     robot: RecordedRobot, actuation: Actuation, values: Array, covariance: Array, weighed: bool
-) -> tuple[Quantity, ...]:
+) -> tuple[IdentifiedQuantity, ...]:
     body, sigma = robot.scenario.chaser, _sigmas(covariance)
     thrusters = body.thrusters if body.actuation == "thrusters" else ()
     count, axes = len(actuation.along), actuation.axes
@@ -309,11 +311,13 @@ def _quantities(
     values, sigma = values * scales, sigma * scales
     moment = float(values[1 + count + 3 : 1 + count + 6].mean())
     tick_s = 1.0 / robot.scenario.time.rate_hz
-    out: list[Quantity] = []
+    out: list[IdentifiedQuantity] = []
 
     def add(name: str, unit: str, row: int, stated: float, size: float) -> None:
         known = bool(0.0 < sigma[row] < _FIT.known_share * size)
-        out.append(Quantity(name, unit, stated, float(values[row]), float(sigma[row]), known))
+        out.append(
+            IdentifiedQuantity(name, unit, stated, float(values[row]), float(sigma[row]), known)
+        )
 
     if not weighed:
         add("mass", "kg", 0, body.mass_kg, float(values[0]))

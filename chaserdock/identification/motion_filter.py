@@ -79,7 +79,7 @@ def actuation_of(body: Body) -> Actuation:
 
 
 @dataclass(frozen=True, eq=False)
-class Parameters:
+class RobotParameters:
     """Parameters as one vector: ``gains`` (C,), ``centre_m`` (3,) CRF, ``inertia`` (6,) about it,
     ``push`` (6,): constant force and torque at the origin of CRF in its axes, ``delay_s``,
     ``bias_rad_s`` (3,) of the rate. Thrusts, inertia and push are in units of the mass.
@@ -107,7 +107,7 @@ class Parameters:
         )
 
     @classmethod
-    def of(cls, vector: Array) -> Parameters:
+    def of(cls, vector: Array) -> RobotParameters:
         """Return the parameters in a vector (P,)."""
         gains, rest = vector[:-19], vector[-19:]
         return cls(gains, rest[:3], rest[3:9], rest[9:15], float(rest[15]), rest[16:])
@@ -201,7 +201,7 @@ class MotionFilter:
     """Linearizes about ``parameters`` of a robot of ``mass_kg``."""
 
     def __init__(
-        self, actuation: Actuation, mass_kg: float, parameters: Parameters, noise: Noise
+        self, actuation: Actuation, mass_kg: float, parameters: RobotParameters, noise: Noise
     ) -> None:
         self._actuation, self._mass_kg, self._p, self._noise = actuation, mass_kg, parameters, noise
         self._tensor = parameters.tensor

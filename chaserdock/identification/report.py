@@ -9,7 +9,7 @@ import numpy as np
 
 from chaserdock.toml_text import toml_value
 
-from .fit import Identification, Quantity
+from .fit import IdentifiedQuantity, RobotIdentification
 
 _DIGITS = 6
 """Significant digits of pasted values: beyond any accuracy of a run."""
@@ -19,7 +19,7 @@ stated one notices.
 """
 
 
-def identification_lines(found: Identification) -> list[str]:
+def identification_lines(found: RobotIdentification) -> list[str]:
     """Return the lines of the text: table, remarks, TOML."""
     robot = found.robot
     lines = [
@@ -38,7 +38,7 @@ def identification_lines(found: Identification) -> list[str]:
     return lines
 
 
-def identification_values(found: Identification) -> dict[str, Any]:
+def identification_values(found: RobotIdentification) -> dict[str, Any]:
     """Return the identification as plain values for JSON: quantities by name, in SI units."""
     return {
         "chaser": found.robot.chaser,
@@ -58,11 +58,11 @@ def identification_values(found: Identification) -> dict[str, Any]:
     }
 
 
-def _label(q: Quantity) -> str:
+def _label(q: IdentifiedQuantity) -> str:
     return f"{q.name}, {q.unit}" if q.unit else q.name
 
 
-def _remarks(found: Identification) -> list[str]:
+def _remarks(found: RobotIdentification) -> list[str]:
     thrusters = found.robot.scenario.chaser.actuation == "thrusters"
     out: list[str] = []
     if not found.weighed:
@@ -85,7 +85,7 @@ def _remarks(found: Identification) -> list[str]:
     return out
 
 
-def _toml(found: Identification) -> list[str]:
+def _toml(found: RobotIdentification) -> list[str]:
     """Return the scenario's keys with the identified values, ready to paste."""
     body = found.robot.scenario.chaser
     values = {q.name: _rounded(q.value) for q in found.quantities if q.known}

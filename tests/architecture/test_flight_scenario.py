@@ -57,7 +57,7 @@ FORBIDDEN_ANYWHERE = {
     "thruster_failure", "fault", "reported_failures", "success", "settling_s", "effects",
     "sun_direction", "ambient", "lamp", "eclipses", "earth", "description",
 }  # fmt: skip
-GATEWAY_OWNERS = ("check", "lab", "process")
+GATEWAY_OWNERS = ("check", "lab", "process", "resume")
 """Modules of the gateway that know the scenario's devices and limits."""
 FORBIDDEN_PATHS = {"target.position_m", "target.q_wxyz", "target.attitude_deg"}
 

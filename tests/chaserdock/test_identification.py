@@ -20,12 +20,12 @@ from harness import ROOT, finished
 from mcap_writers import copy_log
 from scipy.stats import chi2
 
-from chaserdock.identification.fit import Identification, identify, identify_robot
+from chaserdock.identification.fit import RobotIdentification, identify, identify_robot
 from chaserdock.identification.motion_filter import (
     INERTIA_ROWS,
     MotionFilter,
     Noise,
-    Parameters,
+    RobotParameters,
     actuation_of,
     commanded_over,
 )
@@ -118,22 +118,22 @@ def test_two_passes_without_noise_find_what_differs() -> None:
     true[4:16] *= 20.0 / 24.0  # the filter counts in units of the stated mass
     scale = np.array([1.0, *[0.01] * 3, *[0.3] * 6, *[0.3] * 3, *[0.03] * 3, 0.1, *[1e-9] * 3])
     off = 0.02 * np.random.default_rng(5).choice([-1.0, 1.0], 20)
-    own = Parameters.of(true + off * scale)
+    own = RobotParameters.of(true + off * scale)
     for _ in range(2):
         commanded = commanded_over(robot.actuators, robot.motion.time_ns, own.delay_s)
         noise = Noise(np.eye(12) * 1e-10, np.zeros(12), 0.0)
         run = MotionFilter(actuation_of(robot.scenario.chaser), 20.0, own, noise).run
         found = run(robot.motion, commanded, np.zeros(20), scale)
-        own = Parameters.of(own.vector + found.change)
+        own = RobotParameters.of(own.vector + found.change)
     assert np.all(np.abs(own.vector - true) < 5e-4 * scale + 1e-9)
 
 
 @pytest.fixture(scope="module")
-def found() -> Identification:
+def found() -> RobotIdentification:
     return identify_robot(free_flyer(1, 60, SIGMAS))
 
 
-def test_a_free_flyer_is_identified(found: Identification) -> None:
+def test_a_free_flyer_is_identified(found: RobotIdentification) -> None:
     assert all(q.known for q in found.quantities)
     for q in found.quantities:
         assert abs(q.value - TRUE[q.name]) < 4.0 * q.sigma, q
@@ -157,7 +157,7 @@ def test_standard_deviations_are_those_of_the_errors() -> None:
     assert 0.001 < chi2.cdf(total, freedoms) < 0.999, total / freedoms
 
 
-def test_its_lines_can_be_pasted(found: Identification, tmp_path: Path) -> None:
+def test_its_lines_can_be_pasted(found: RobotIdentification, tmp_path: Path) -> None:
     pasted = load_pasted(found, "single", tmp_path)
     values = {q.name: q.value for q in found.quantities}
     assert pasted.chaser.mass_kg == pytest.approx(values["mass"], rel=1e-5)
@@ -169,7 +169,7 @@ def test_its_lines_can_be_pasted(found: Identification, tmp_path: Path) -> None:
     assert true.inertia_kg_m2[3] == pytest.approx(values["Ixy"], rel=1e-5)
 
 
-def load_pasted(found: Identification, base: str, folder: Path) -> Scenario:
+def load_pasted(found: RobotIdentification, base: str, folder: Path) -> Scenario:
     lines = identification_lines(found)
     text = "\n".join([f'extends = "{base}"', 'name = "pasted"', *lines[lines.index("") :]])
     (folder / "pasted.toml").write_text(text, encoding="utf-8")
@@ -233,7 +233,7 @@ def test_the_command_says_what_is_wrong() -> None:
     )
 
 
-def flight_errors(log: Path, scenario: Scenario) -> tuple[Array, Array, Identification]:
+def flight_errors(log: Path, scenario: Scenario) -> tuple[Array, Array, RobotIdentification]:
     """Return the errors of all that a flight of a weighed chaser tells, their covariance, and what
     it tells."""
     opened = open_log(log)

@@ -301,7 +301,7 @@ def test_gates_are_quantiles_of_chi_square() -> None:
 
 @pytest.mark.parametrize("markers", [0, 1, 5])
 def test_drawn_sightings_count_with_the_stated_covariance(markers: int) -> None:
-    """They have white errors of it only: nothing persists with a view, and nothing is added."""
+    """They have white errors: nothing persists with a view, and only the floor is added."""
     drawn = scenario(perception={"name": "statistical"})
     p = parameters_of(drawn)
     noise = p.sighting_noise(markers)
@@ -313,7 +313,8 @@ def test_drawn_sightings_count_with_the_stated_covariance(markers: int) -> None:
         covariance=vector(stated),
         reprojection_rms_px=0.0,
     )
-    np.testing.assert_array_equal(sighting_covariance(solution, p), stated)
+    floor = np.repeat([p.floor_sighting_m**2, p.floor_sighting_rad**2], 3)
+    np.testing.assert_allclose(sighting_covariance(solution, p), stated + np.diag(floor))
     assert parameters_of(scenario()).sighting_noise(markers).view_ratio > 0.0
 
 

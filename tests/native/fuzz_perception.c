@@ -39,7 +39,14 @@ static Settings settings(void) {
     s.edge_sigma_spread = uniform(0.05, 0.5);
     s.rounds = (double)whole(0, 3), s.iterations = (double)whole(1, 4),
     s.strip_iterations = (double)whole(1, 5);
-    s.uncertain_px = uniform(0.5, 4.0), s.uncertain_level = uniform(0.0, 200.0);
+    s.agreement_sigmas = uniform(0.0, 5.0), s.fade_spread = uniform(0.01, 0.1),
+    s.alike_columns = uniform(1.0, 64.0);
+    s.least_sigma_px = uniform(1e-3, 0.02), s.aligned_sigma_px = uniform(0.0, 0.1),
+    s.fine_sigma_px = uniform(0.0, 0.5), s.border_sigma_px = uniform(0.0, 0.5);
+    s.outer_sigma_px = uniform(0.0, 0.5), s.cut_sigma_px = uniform(0.0, 0.5),
+    s.cut_spread_px = uniform(0.0, 0.5), s.common_share = uniform(0.0, 0.9);
+    s.free_blur = uniform(0.0, 1.0), s.blur_sigma_px = uniform(0.0, 0.1),
+    s.adjoining_sigma_px = uniform(0.0, 2.0);
     return s;
 }
 
@@ -56,7 +63,8 @@ static void refine_corners(void) {
     const int64_t height = whole(2, 40), width = whole(2, 40), n = whole(0, 2);
     const uint8_t *image = image_of(height, width);
     double *camera = outputs(4), *margin = doubles(n, 0.0, 0.3), *corners = outputs(8 * n),
-           *sigma = outputs(n), *frames = doubles(9 * n, -0.02, 0.02);
+           *whitening = outputs(64 * n), *common = outputs(8 * n),
+           *frames = doubles(9 * n, -0.02, 0.02);
     uint8_t *good = bytes(n), *outlined = bytes(n), *framed = bytes(n);
     Settings set = settings();
     Lens lens = any_lens();
@@ -75,10 +83,11 @@ static void refine_corners(void) {
     }
     double *given = copy_of(corners, 8 * n);
     NAME(refine_corners)(image, height, width, camera, distorted ? &lens : NULL, frames, framed, &set,
-                         (double)whole(3, 9), n, margin, outlined, corners, good, sigma);
+                         (double)whole(3, 9), n, margin, outlined, corners, good, whitening, common);
     for (int64_t m = 0; m < n; m++) {
-        CHECK(good[m] <= 1 && sigma[m] >= 1.0 && finite(sigma[m]));
+        CHECK(good[m] <= 1);
         if (good[m]) CHECK(all_finite(corners + 8 * m, 8) && all_finite(given + 8 * m, 8));
+        if (good[m]) CHECK(all_finite(whitening + 64 * m, 64) && all_finite(common + 8 * m, 8));
         else CHECK(same_bits(corners + 8 * m, given + 8 * m, 8));
     }
 }
@@ -109,20 +118,20 @@ static void read_markers(void) {
 }
 
 static void refine_pose(void) {
-    const int64_t n = whole(0, 8);
-    double *lens = lens_of_camera(), *points = doubles(3 * n, -0.3, 0.3),
-           *pixels = doubles(2 * n, 0.0, 640.0);
-    double *weight = doubles(2 * n, 0.0, 2.0), *pose = doubles(12, -1.0, 1.0);
+    const int64_t n = whole(0, 3);
+    double *lens = lens_of_camera(), *points = doubles(12 * n, -0.3, 0.3),
+           *pixels = doubles(8 * n, 0.0, 640.0);
+    double *whitening = doubles(64 * n, -2.0, 2.0), *pose = doubles(12, -1.0, 1.0);
     pose[2] = value(0.2, 3.0);
     if (chance(0.5)) /* near a solution */
-        for (int64_t i = 0; i < n; i++) {
+        for (int64_t i = 0; i < 4 * n; i++) {
             double at[3];
             multiply3(pose + 3, points + 3 * i, at);
             for (int k = 0; k < 2; k++)
                 pixels[2 * i + k] = lens[k] * (at[k] + pose[k]) / (at[2] + pose[2]) + lens[2 + k] +
                                     value(-1.0, 1.0);
         }
-    int64_t found = NAME(refine_pose)(lens, points, pixels, weight, n, pose);
+    int64_t found = NAME(refine_pose)(lens, points, pixels, whitening, n, pose);
     CHECK(found == 0 || found == 1);
     if (found) CHECK(all_finite(pose, 12));
 }
@@ -305,7 +314,9 @@ static void measure_pose(void) {
                             value(100.0, 160.0),
                             480.0,
                             270.0};
-    *limits = (MarkerLimits){value(0.01, 0.1), value(10.0, 30.0), value(1.0, 10.0),
+    *limits = (MarkerLimits){value(0.01, 0.1), value(0.01, 0.1), value(0.0, 0.5),
+                             value(0.0, 0.5),  value(10.0, 60.0), value(3.0, 9.0),
+                             value(0.5, 3.0),  value(0.0, 0.4),   value(1.0, 10.0),
                              value(0.0, 0.4),  value(0.0, 0.8),   value(0.0, 3.0)};
     double *pose = doubles(12, -0.1, 0.1), *covariance = outputs(36), *error = outputs(6);
     for (int i = 0; i < 3; i++) pose[3 + 4 * i] = value(0.9, 1.0);

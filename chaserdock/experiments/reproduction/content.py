@@ -17,7 +17,7 @@ from chaserdock.experiments.page import PageSection, Table
 from chaserdock.experiments.plan import ExperimentPlan
 
 from .earlier import NO_PAGE, EarlierPage
-from .flown import Flown, flights_section
+from .flown import Provenances, flights_section
 from .headline import Tables, free_section, result_section
 from .paper import BASELINE, PAPER_S, ROWS
 from .plan import (
@@ -63,7 +63,7 @@ UNITS: dict[Quantity, tuple[float, str]] = {
 def sections(
     plan: ExperimentPlan,
     results: Summaries,
-    flown: Flown,
+    flown: Provenances,
     quick: bool,
     earlier: EarlierPage = NO_PAGE,
 ) -> list[PageSection]:

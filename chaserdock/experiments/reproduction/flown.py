@@ -18,11 +18,11 @@ from .tables import NONE
 ALONE = "controller alone"
 FREE, MISSIONS = "free starts", "missions"
 
-Flown = Mapping[str, Provenance | None]
+Provenances = Mapping[str, Provenance | None]
 """Where and when flights were flown, by their label; None: not known."""
 
 
-def flown_by_label(plan: ExperimentPlan, outcomes: Mapping[str, FlightOutcome]) -> Flown:
+def flown_by_label(plan: ExperimentPlan, outcomes: Mapping[str, FlightOutcome]) -> Provenances:
     """Return the provenance of the flights that have a result."""
     ended = ((f.label, outcomes[f.name]) for f in plan.flights if f.name in outcomes)
     return {label: outcome.flown for label, outcome in ended if outcome.summary is not None}
@@ -41,7 +41,7 @@ def place_of(flight: PlannedFlight) -> tuple[str, str]:
     return labels.get(rest[0], BASELINE.label), ALONE
 
 
-def flights_section(plan: ExperimentPlan, flown: Flown) -> PageSection:
+def flights_section(plan: ExperimentPlan, flown: Provenances) -> PageSection:
     """Return the section on where and when the flights of every row were flown."""
     planned = Counter(map(place_of, plan.flights))
     known: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)

@@ -26,7 +26,14 @@ from chaserdock_agents.gateway.devices import (
     RobotCommand,
 )
 from chaserdock_protocol import topics
-from chaserdock_protocol.messages import ArmingCommand, ArmingReply
+from chaserdock_protocol.messages import (
+    ArmingCommand,
+    ArmingReply,
+    CommandReply,
+    MissionEnd,
+    OperatorCommand,
+    Reference,
+)
 from chaserdock_protocol.pose_image import encode_pose
 from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.transport import Node
@@ -214,13 +221,56 @@ def arm_again(options: ProcessOptions, after_s: float) -> int:
     return arm_when_ready(options)
 
 
+HELD_S, LONGEST_S = 3.0, 300.0
+"""Time for which a chaser must hold before the operator commands it again, and the longest flight
+that is watched, s.
+"""
+
+
+def approach_again(options: ProcessOptions) -> int:
+    """Command ``approach`` to each chaser that has backed out and holds since, as flight software
+    leaves that to a person, until the mission ends; return 0.
+    """
+    node = Node("watcher", "viewer", options.link)
+    node.subscribe(topics.REFERENCE)
+    node.subscribe(topics.END)
+    backed_out: set[int] = set()
+    begun = node.host.now_s()
+    try:
+        while node.host.now_s() - begun < LONGEST_S:
+            received = node.receive(0.5)
+            match None if received is None else received.message:
+                case MissionEnd():
+                    return 0
+                case Reference(chaser=i, phase="retreat" | "abort"):
+                    backed_out.add(i)
+                case Reference(chaser=i, phase="hold", phase_time_s=held_s) if (
+                    i in backed_out and held_s > HELD_S
+                ):
+                    again = OperatorCommand(command="approach", chaser=i, operator="test")
+                    reply = node.query(topics.OPERATE_KEY, again, CommandReply, 1.0)
+                    if reply is not None and reply.accepted:
+                        backed_out.discard(i)
+                case _:
+                    pass
+        return 1
+    finally:
+        node.close()
+
+
 def fly(
-    scenario: Path, folder: Path, lab: Any, monkeypatch: pytest.MonkeyPatch, **others: Any
+    scenario: Path,
+    folder: Path,
+    lab: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    overrides: tuple[str, ...] = (),
+    **others: Any,
 ) -> SimulatedFlight:
     """Fly a scenario with ``[lab]`` on a virtual laboratory, armed as soon as it can be."""
     install(monkeypatch, lab)
     processes = {"world": gateway.main, "operator": arm_when_ready, **others}
-    overrides = ("simulation.mode='realtime'", "camera.effects.jpeg_quality=0")  # images are poses
+    # Images are poses.
+    overrides = ("simulation.mode='realtime'", "camera.effects.jpeg_quality=0", *overrides)
     return simulate(scenario, folder, overrides, others=processes)
 
 

@@ -31,6 +31,10 @@ are armed again.
 KILLED = "gateway killed"
 SECONDS = {"tracking": 25.0, "planar-docking": 40.0, "free-flyer-docking": 40.0}
 """Flights, and the time in which faults begin, s after the first command."""
+ENDS_S = {"tracking": 60.0, "planar-docking": 120.0, "free-flyer-docking": 120.0}
+"""Length of flights with faults, s: a robot that lost its target at the latest time has backed out
+and docked again by then, and one that tracks is back at its place.
+"""
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,9 @@ def fly_laboratory(name: str, with_faults: bool, seed: int) -> LabFlight:
             error = camera_errors(scenario, i)
             lab.mount(i, error.turn_rad, error.shift_m, error.focal_share)
     others: dict[str, Any] = {}
+    if with_faults:
+        others["overrides"] = (f"duration_s={ENDS_S[name]}",)
+        others["watcher"] = virtual.approach_again
     killed_s = next((f.at_s for f in faults if f.kind == KILLED), None)
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         if killed_s is not None:
@@ -138,13 +145,15 @@ def fly_laboratory(name: str, with_faults: bool, seed: int) -> LabFlight:
 
 
 def held_reasons(folder: Path) -> str:
-    """Return the last change of phase of each chaser, as the controller states it."""
-    last: dict[str, str] = {}
+    """Return the last two events of each chaser, as the controller states them: that it holds, and
+    what for.
+    """
+    last: dict[str, list[str]] = {}
     log = chaserdock.open_log(folder)
     for event in log.messages("controller/event"):
         if found := re.match(r"(chaser \d+): (.*)", event.what):
-            last[found[1]] = event.what
-    return "; ".join(last[name] for name in sorted(last))
+            last[found[1]] = [*last.get(found[1], [])[-1:], event.what]
+    return "; ".join(what for name in sorted(last) for what in last[name])
 
 
 STEADY_S = 28.0

@@ -158,6 +158,9 @@ def test_parts_of_a_tick_hold_its_impulse_and_its_first_moment(gap_s: float) -> 
     assert [q.time_ns for q in parts] == [*(s.sim_time_ns for s in seen), time_ns]
     total = sum(q.chasers[1].impulse.impulse for q in parts)
     np.testing.assert_allclose(total, given.impulse, rtol=1e-7)
+    # Process noise, whose variance goes by the square of the magnitude, is that of the whole tick.
+    noise = sum(q.chasers[1].impulse.magnitude ** 2 for q in parts)
+    np.testing.assert_allclose(noise, given.magnitude**2, rtol=1e-7)
     # About the middle of what is covered: each part's own moment, and its impulse times its lead.
     middle_s, moment, end_ns = PERIOD_S / 2, np.zeros(6), begin_ns
     for part in parts:
@@ -167,7 +170,6 @@ def test_parts_of_a_tick_hold_its_impulse_and_its_first_moment(gap_s: float) -> 
         assert part.covered_s == pytest.approx(to_s - from_s, abs=1e-9)
         share = (to_s - from_s) / PERIOD_S
         np.testing.assert_allclose(own.impulse, share * given.impulse, rtol=1e-7)
-        np.testing.assert_allclose(own.magnitude, share * given.magnitude, rtol=1e-7)
         moment += own.moment + own.impulse * (middle_s - (from_s + to_s) / 2)
     np.testing.assert_allclose(moment, given.moment, atol=1e-8)
     assert [q.chasers[0].contact for q in parts] == [False] * len(seen) + [True]

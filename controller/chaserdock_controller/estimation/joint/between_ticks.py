@@ -6,6 +6,7 @@ split at their exposures, and the filter processes the parts one after the other
 from __future__ import annotations
 
 import dataclasses
+import math
 from itertools import groupby
 
 import numpy as np
@@ -21,7 +22,8 @@ def split_tick(since_ns: int, record: FilterTick) -> list[FilterTick]:
     one up to the tick with its odometry.
 
     Impulses are spread evenly over the time that they cover. Their first moment goes to the longest
-    part, which leaves the motion up to the tick as it was.
+    part, which leaves the motion up to the tick as it was. Magnitudes, which scale process noise,
+    go by the root of the time: the variances of the parts add up to that of the whole tick.
     """
     exposures = [
         (time_ns, {s.chaser: s for s in group})
@@ -64,7 +66,7 @@ def _part_of(
     impulse = AppliedImpulse(
         given.impulse * share,
         given.moment if holds_moment else np.zeros(6),
-        given.magnitude * share,
+        given.magnitude * math.sqrt(share),
         given.measured,
     )
     if is_last:

@@ -367,18 +367,20 @@ def test_innovations_of_white_sightings_are_as_large_as_their_covariance_states(
     assert means[1] < 0.5
 
 
+def displaced(inputs: EstimatorInputs) -> EstimatorInputs:
+    """Return the inputs with the second sighting displaced by half a metre."""
+    good, bad = inputs.sightings
+    solution = bad.solutions[0]
+    place = vector(np.add(solution.position_m, [0.0, 0.5, 0.0]))
+    wrong = msgspec.structs.replace(solution, position_m=place)
+    return replace(inputs, sightings=(good, msgspec.structs.replace(bad, solutions=(wrong,))))
+
+
 def test_innovation_of_a_rejected_sighting_is_stated_too() -> None:
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 11)
     estimator = estimator_for(flight.errors, 2)
     assert len(innovations_of(estimator, flight, 1)) == 1  # the other one starts the target
     innovations_of(estimator, flight, 30)
-
-    def displaced(inputs: EstimatorInputs) -> EstimatorInputs:
-        good, bad = inputs.sightings
-        solution = bad.solutions[0]
-        place = vector(np.add(solution.position_m, [0.0, 0.5, 0.0]))
-        wrong = msgspec.structs.replace(solution, position_m=place)
-        return replace(inputs, sightings=(good, msgspec.structs.replace(bad, solutions=(wrong,))))
 
     good, bad = innovations_of(estimator, flight, 1, displaced)
     assert (good.chaser, good.used, bad.chaser, bad.used) == (0, True, 1, False)
@@ -676,14 +678,6 @@ def test_one_of_two_cameras_that_errs_is_no_majority() -> None:
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 11)
     estimator = estimator_for(flight.errors, 2)
     fly(estimator, flight, 5.0)
-
-    def displaced(inputs: EstimatorInputs) -> EstimatorInputs:
-        good, bad = inputs.sightings
-        solution = bad.solutions[0]
-        place = vector(np.add(solution.position_m, [0.0, 0.5, 0.0]))
-        wrong = msgspec.structs.replace(solution, position_m=place)
-        bad = msgspec.structs.replace(bad, solutions=(wrong,))
-        return replace(inputs, sightings=(good, bad))
 
     fly(estimator, flight, 2.0, displaced)
     assert estimator.reinitialisations == 0

@@ -9,7 +9,7 @@ import itertools
 import json
 import math
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,6 +30,10 @@ from .odometry import BodyTrack, MotionBounds
 
 _REMEMBERED = 64
 """Arrivals from which rate and jitter of a device are computed."""
+_BLIND_NS = 1_000_000_000
+"""Time without a new image of a chaser, ns, after which it is warned of: several images of any
+camera.
+"""
 
 
 @dataclass
@@ -181,3 +185,31 @@ class CameraFeed:
             if self.clock.add(frame.stamp_ns, frame.arrived_ns):
                 self.watch.refused["its clock has stepped"] += 1
             yield frame.image, self.clock.host_ns(frame.stamp_ns)
+
+
+class ImageWatch:
+    """Notices chasers whose cameras are silent, or repeat an image. Times in ns."""
+
+    def __init__(self, chasers: Iterable[int]) -> None:
+        self._chasers = tuple(chasers)
+        self._newest_ns: dict[int, int] = {}
+        self._blind: set[int] = set()
+
+    def expect(self, now_ns: int) -> None:
+        """Expect images of all chasers from now on."""
+        self._newest_ns = dict.fromkeys(self._chasers, now_ns)
+
+    def note(self, chaser: int, now_ns: int) -> None:
+        """Note a new image of a chaser."""
+        self._newest_ns[chaser] = now_ns
+        self._blind.discard(chaser)
+
+    def newly_blind(self, now_ns: int) -> list[int]:
+        """Return the chasers without a new image for too long, each once for each such time."""
+        found = [
+            i
+            for i in self._chasers
+            if i not in self._blind and now_ns - self._newest_ns[i] > _BLIND_NS
+        ]
+        self._blind.update(found)
+        return found

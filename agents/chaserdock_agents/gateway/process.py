@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import deque
 
 import cv2
 import numpy as np
@@ -36,10 +35,10 @@ from chaserdock_protocol.scenario import Scenario, ScenarioError
 from chaserdock_protocol.transport import Node
 
 from .actuation import RobotActuation
-from .arming import Answer, ArmingRequests, listen_to_keys
+from .arming import Answer, ArmingRequests, BackgroundArming, listen_to_keys
 from .axes import MeasuredPose
 from .devices import DeviceError, DeviceHost, ImageArray
-from .feeds import PoseFeed
+from .feeds import ImageWatch, PoseFeed
 from .images import image_message
 from .lab import Laboratory
 from .odometry import FittedState
@@ -54,10 +53,6 @@ _LONGEST_SOURCE = 200
 """Characters of a device's address that a message repeats."""
 _POSE_PATIENCE_S = 10.0
 """Wait, s, for the first odometry of all robots: devices were opened long before."""
-_BLIND_NS = 1_000_000_000
-"""Time without a new image of a chaser, ns, after which it is warned of: several images of any
-camera.
-"""
 _SETTLING_NS = 200_000_000
 """Time, ns, whose poses must give the first odometry."""
 
@@ -112,11 +107,7 @@ class Gateway:
         self._timing, self._chasers = scenario.timing, len(scenario.chasers)
         self._gate = SafetyGate(scenario.lab.safety)
         self._requests = ArmingRequests()
-        self._arming: tuple[str, Answer] | None = None
-        self._armed: deque[str] = deque()
-        self._is_disarmed_meanwhile = False
-        self._arm_robots, end_arming = node.host.worker(self._ask_robots)
-        node.on_close(end_arming)
+        self._arming = BackgroundArming(node, laboratory.arm)
         self._start_ns = 0
         self._begun, self._resume = begun, options.resume
         if begun is not None:  # a recorder that is behind holds up no mission that goes on
@@ -124,8 +115,7 @@ class Gateway:
         self._used_ns: dict[int, int] = {}
         self._commanded_ns: dict[int, int] = {}
         self._missing: set[int] = set()
-        self._image_ns: dict[int, int] = {}
-        self._blind: set[int] = set()
+        self._images = ImageWatch(c.device.chaser for c in laboratory.cameras)
         self._actuation = {
             f"chaser/{i}": RobotActuation(scenario.chaser, self._timing)
             for i in range(self._chasers)
@@ -175,7 +165,7 @@ class Gateway:
     def _begin(self) -> None:
         """Let the mission's time begin, or go on from its beginning by another gateway."""
         self._start_ns = self._now_ns() if self._begun is None else self._begun.start_ns
-        self._expect_images()
+        self._images.expect(self._mission_ns())
         if self._begun is None and self._resume is not None:
             begun = BegunMission(
                 run_id=self._host.run_id,
@@ -233,7 +223,8 @@ class Gateway:
                 continue
             self._publish_odometry(tick)
             self._publish_docking(tick)
-            self._warn_of_blind_chasers()
+            for chaser in self._images.newly_blind(self._mission_ns()):
+                self._barrier.publish_warning("no new image", f"chaser {chaser}")
             # Cameras run freely: no image belongs to a tick, and no tick waits for one.
             self._barrier.open_tick(tick, images=False)
             if tick == first > 0:
@@ -300,21 +291,8 @@ class Gateway:
             return
         quality = self._scenario.camera.effects.jpeg_quality
         message = image_message(self._timing.rate_hz, quality, chaser, image, exposed_ns)
-        self._image_ns[chaser] = self._mission_ns()
-        self._blind.discard(chaser)
+        self._images.note(chaser, self._mission_ns())
         self._node.publish(topics.IMAGE, message, chaser)
-
-    def _expect_images(self) -> None:
-        self._image_ns = {c.device.chaser: self._mission_ns() for c in self._lab.cameras}
-
-    def _warn_of_blind_chasers(self) -> None:
-        """Publish once for each time that a camera is silent, or repeats an image."""
-        for camera in self._lab.cameras:
-            chaser = camera.device.chaser
-            silent_ns = self._mission_ns() - self._image_ns[chaser]
-            if silent_ns > _BLIND_NS and chaser not in self._blind:
-                self._blind.add(chaser)
-                self._barrier.publish_warning("no new image", f"chaser {chaser}")
 
     def _publish_odometry(self, tick: int) -> None:
         time_ns = self._timing.tick_time_ns(tick)
@@ -386,7 +364,7 @@ class Gateway:
                 continue
             accepted, reason = self._gate.request(action, by, sights)
             if accepted:
-                self._is_disarmed_meanwhile = True
+                self._arming.cancel()
                 self._lab.stop()
             self._answer(action, accepted, reason, answer)
         if self._end_arming(sights):
@@ -404,47 +382,39 @@ class Gateway:
         """Have the robots armed in the background, as they answer after a second, unless something
         forbids it.
         """
-        refusal = "robots are being armed" if self._arming else self._gate.refusal(sights)
+        is_under_way = self._arming.is_under_way
+        refusal = "robots are being armed" if is_under_way else self._gate.refusal(sights)
         if refusal:
             self._answer("arm", False, refusal, answer)
-            return
-        self._arming, self._is_disarmed_meanwhile = (by, answer), False
-        self._arm_robots(None)
-
-    def _ask_robots(self, _: None) -> None:
-        try:
-            self._lab.arm()
-            self._armed.append("")
-        except DeviceError as error:
-            self._armed.append(str(error))
+        else:
+            self._arming.begin(by, answer)
 
     def _end_arming(self, sights: tuple[RobotSight, ...]) -> bool:
         """Let commands pass once all robots are armed, and return whether they are; stop them if
         one is not, or if they were disarmed meanwhile.
         """
-        if self._arming is None or not self._armed:
+        ended = self._arming.take_end()
+        if ended is None:
             return False
-        (by, answer), self._arming = self._arming, None
-        error = self._armed.popleft()
-        if error:
-            accepted, reason = False, self._gate.trip(error)
-        elif self._is_disarmed_meanwhile:
+        if ended.error:
+            accepted, reason = False, self._gate.trip(ended.error)
+        elif ended.is_cancelled:
             accepted, reason = False, self._gate.reason
         else:
-            accepted, reason = self._gate.request("arm", by, sights)
+            accepted, reason = self._gate.request("arm", ended.by, sights)
         if accepted:
             self._lab.forget_motion()
             self._commanded_ns.clear()
-            self._expect_images()
+            self._images.expect(self._mission_ns())
         else:
             self._lab.stop()
-        self._answer("arm", accepted, reason, answer)
+        self._answer("arm", accepted, reason, ended.answer)
         return accepted
 
     def _trip(self, reason: str) -> None:
         if self._gate.is_armed or reason != self._gate.reason:
             self._gate.trip(reason)
-            self._is_disarmed_meanwhile = True
+            self._arming.cancel()
             self._lab.stop()
             self._barrier.publish_warning("disarmed", reason)
 

@@ -10,6 +10,8 @@ and are reported apart.
 
 from __future__ import annotations
 
+import argparse
+import re
 import subprocess
 import sys
 import tempfile
@@ -21,6 +23,7 @@ from common import ROOT, Figures, make_parser, write_json
 
 sys.path.insert(0, str(ROOT / "tests"))
 
+from parts.tuned_numbers import survey
 from source_changes import SOURCES, Mutant, apply, copy_checkout, read_mutants, run_python
 
 COPIED = (
@@ -73,6 +76,40 @@ def failed(folder: Path, tests: Sequence[str], timeout_s: float) -> str:
     )
 
 
+def failing(folder: Path, tests: Sequence[str], timeout_s: float) -> str:
+    """Run single tests, but for slow ones, until one fails. Return its name, "" if all pass or do
+    not end in time.
+
+    Raises RuntimeError if pytest cannot run them.
+    """
+    fast = ("-m", "not slow", "-x", "-q", "-rfE", "--tb=no", "-p", "no:cacheprovider")
+    try:
+        done = run_python(folder, "-m", "pytest", *fast, *tests, timeout_s=timeout_s)
+    except subprocess.TimeoutExpired:
+        return ""
+    if done.returncode in (0, 5):  # 5: all are slow
+        return ""
+    names = re.findall(r"^(?:FAILED|ERROR) (\S+::.*?)(?: - |$)", done.stdout, re.MULTILINE)
+    if names:
+        return names[0]
+    if done.returncode == 2:
+        return tests[0]  # its modules cannot be imported
+    raise RuntimeError(f"pytest: status {done.returncode}\n{done.stdout}{done.stderr}")
+
+
+def survey_numbers(options: argparse.Namespace) -> Figures:
+    """Return how many numbers a test notices when they are doubled or halved."""
+
+    def find_failing(folder: Path, tests: Sequence[str]) -> str:
+        return failing(folder, tests, options.timeout)
+
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        copy_checkout(folder, COPIED)
+        only = options.only or [""]
+        return survey(options.numbers, folder, only, find_failing, options.quick)
+
+
 def killer(folder: Path, mutant: Mutant, timeout_s: float) -> str:
     """Return the test that kills a mutant, "" if it survives. The sources in ``folder`` are then as
     before.
@@ -98,7 +135,19 @@ def main() -> int:
         metavar="SECONDS",
         help="for the tests of one mutant",
     )
+    parser.add_argument(
+        "--numbers",
+        type=Path,
+        metavar="DATA",
+        help="instead, double and halve each number that a module names, and run the tests that "
+        "use it by this data of pytest --cov --cov-context=test",
+    )
     options = parser.parse_args()
+    if options.numbers:
+        figures = survey_numbers(options)
+        print(", ".join(f"{name} {count}" for name, count in figures.items()))
+        write_json(options.json, figures)
+        return 0
     mutants = [m for m in read_mutants() if any(text in m.name for text in options.only or [""])]
     mutants = mutants[::5] if options.quick else mutants
     if not mutants:

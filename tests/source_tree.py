@@ -31,6 +31,20 @@ def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
 
+def is_numeric(value: ast.expr | None) -> bool:
+    """Return whether an expression is a number, or a tuple or list of numbers."""
+    match value:
+        case ast.Constant(value=number):
+            return type(number) in (int, float)
+        case ast.UnaryOp(operand=operand):
+            return is_numeric(operand)
+        case ast.BinOp(left=left, right=right):
+            return is_numeric(left) and is_numeric(right)
+        case ast.Tuple(elts=items) | ast.List(elts=items):
+            return bool(items) and all(map(is_numeric, items))
+    return False
+
+
 def module_name(path: Path) -> str:
     """Return the dotted name of a module of ours."""
     package = next(f for f in PACKAGES.values() if path.is_relative_to(f))

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from source_tree import MODULES, ROOT, tree_of
+from source_tree import MODULES, ROOT, is_numeric, tree_of
 
 ALLOWED: dict[str, int] = {}
 """Numbers of each root that may still be without a reason. It only falls; delete a root at 0."""
@@ -18,20 +18,6 @@ C_NUMBER = re.compile(
     r"#define\s+\w+\s+\(?[-\d.]|(?:static\s+)?const\s+(?:float|double|int|long|size_t)\s.*="
 )
 """A line of C, outside of functions, that defines a number or an array of numbers."""
-
-
-def is_numeric(value: ast.expr | None) -> bool:
-    """Return whether an expression is a number, or a tuple or list of numbers."""
-    match value:
-        case ast.Constant(value=number):
-            return type(number) in (int, float)
-        case ast.UnaryOp(operand=operand):
-            return is_numeric(operand)
-        case ast.BinOp(left=left, right=right):
-            return is_numeric(left) and is_numeric(right)
-        case ast.Tuple(elts=items) | ast.List(elts=items):
-            return bool(items) and all(map(is_numeric, items))
-    return False
 
 
 def is_text(statement: ast.stmt | None) -> bool:

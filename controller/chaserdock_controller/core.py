@@ -10,7 +10,6 @@ from chaserdock_protocol.scenario import FlightScenario
 
 from .estimation.estimators import make_estimator
 from .estimation.guarded import FAILED as ESTIMATOR_FAILED
-from .estimation.guarded import GuardedEstimator
 from .estimation.stage import EstimationStage
 from .estimation.types import Estimator
 from .guidance.stage import GuidanceStage
@@ -68,9 +67,8 @@ class ControllerCore:
 
     def failed_parts(self) -> tuple[str, ...]:
         """Return the parts that failed in the last tick, as they are counted."""
-        estimator, planning = self.estimation.estimator, self.planning
-        found = isinstance(estimator, GuardedEstimator) and estimator.failed
-        return (*((ESTIMATOR_FAILED,) if found else ()), *planning.failed)
+        estimator_failed = (ESTIMATOR_FAILED,) if self.estimation.estimator.failed else ()
+        return (*estimator_failed, *self.planning.failed)
 
     @property
     def estimator(self) -> Estimator:

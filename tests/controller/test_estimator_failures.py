@@ -165,7 +165,7 @@ def test_result_that_cannot_be_used_is_a_failure(kind: str) -> None:
         MADE[-1].replaced = wrong
         flight.step()
         found = guarded.update(flight.inputs())
-    assert cast(GuardedEstimator, guarded).failed
+    assert guarded.failed
     assert (found.target.status, found.chasers, len(found.events)) == ("predicting", (), 1)
 
 
@@ -199,7 +199,7 @@ def test_every_call_of_an_estimator_is_guarded(call: str) -> None:
     assert [e.level for e in events if e.text.startswith(f"estimator failed: 'own': {call}: ")] == [
         "warning"
     ]
-    assert cast(GuardedEstimator, guarded).failed
+    assert guarded.failed
 
 
 class Scripted:

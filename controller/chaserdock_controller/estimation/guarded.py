@@ -70,8 +70,7 @@ class GuardedEstimator(Estimator):
     A failure is an exception, a result of another type, or a value that is not finite. Where
     ``update`` fails, the last estimate is continued at constant rates with its covariance, status
     "predicting", and "lost" once the failures in a row are an error; the chasers' motions are then
-    their odometry. ``failed``: a call since the update before the newest has failed. It is an event
-    of the newest update.
+    their odometry.
     """
 
     def __init__(self, name: str, estimator: Any, chasers: int) -> None:
@@ -79,7 +78,12 @@ class GuardedEstimator(Estimator):
         self._watch = FailureWatch(name)
         self._last: TargetState | None = None
         self._detail = ""
-        self._continues = self.failed = False
+        self._continues = self._failed = False
+
+    @property
+    def failed(self) -> bool:
+        """Return whether a call has failed: an event of the newest update."""
+        return self._failed
 
     def update(self, inputs: EstimatorInputs) -> Estimate:
         """Return the estimator's result, or the continued estimate if it fails."""
@@ -91,7 +95,7 @@ class GuardedEstimator(Estimator):
 
         found = self._guarded("update", checked, None)
         report = self._watch.update(FAILED, self._detail)
-        self.failed, self._detail = bool(self._detail), ""
+        self._failed, self._detail = bool(self._detail), ""
         self._continues = found is None
         if found is None:
             found = Estimate(self._continued(inputs.time_ns))

@@ -149,6 +149,12 @@ class Estimator(Protocol):
         """Return how often the target's estimate was restarted, for statistics."""
         return 0
 
+    @property
+    def failed(self) -> bool:
+        """Return whether a call since the update before the newest has failed. An installed
+        estimator is guarded, so that its failures are events."""
+        return False
+
     def disturbed_motion(self, chaser: int) -> DisturbedMotion | None:
         """Return what decides where a chaser coasts besides its position and velocity, after the
         newest tick; None if it or the target is unknown. Needed for passive safety only.

@@ -23,6 +23,9 @@ from .native import LIBRARY, function
 from .pnp import MarkerTable
 from .refine import PoseInCamera
 
+PLACE_CELLS = 0.3
+"""Standard deviation, cells, of the place where a marker's cells correlate best: they are tried at
+every half cell."""
 LEAST_CORRELATION = 0.7
 """Correlation of a marker's cells with those of its id, above which it is there: uniform noise in
 36 cells exceeds it once in 100,000."""
@@ -76,8 +79,12 @@ class CellReader:
         camera: Camera,
         pose: PoseInCamera,
         known: NDArray[np.intp],
+        reach: int = 0,
     ) -> ReadMarkers:
-        """Read the markers that a pose shows in the distorted grey image, except ``known`` rows."""
+        """Read the markers that a pose shows in the distorted grey image, except ``known`` rows.
+
+        Each is looked for up to ``reach`` half cells away from where the pose puts it.
+        """
         m = len(self._table.ids)
         surface = np.ascontiguousarray(self._table.surface @ pose.rotation.T)
         position = np.array(pose.position, dtype=float)
@@ -90,6 +97,6 @@ class CellReader:
             (c_double * 4)(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
             lens, byref(LIMITS), address(surface), address(position),
             address(self._margin), c_int64(m), address(self._white), c_int64(self.cells),
-            address(skip), address(px), address(finest), address(found),
+            address(skip), c_int64(reach), address(px), address(finest), address(found),
         )  # fmt: skip
         return ReadMarkers(px, finest, np.flatnonzero(found > LEAST_CORRELATION))

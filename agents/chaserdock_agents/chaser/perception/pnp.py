@@ -250,7 +250,7 @@ def solve(
         if len(used) == 1 and not added:
             seen, pose, added = _with_neighbours(first, pose, further)
             first = seen
-        if added or len(used) > 1:
+        else:
             seen, pose, left = _with_further(seen, pose, further, _LEFT_HALF_CELLS)
             added += left
         used = used + [len(which) + k for k in added]
@@ -495,11 +495,13 @@ def _with_neighbours(
         if found is None or found[1][0] != 0:
             continue
         seen, refined, kept = _with_agreeing(alone, found[0], more)
+        seen, refined, left = _with_further(seen, refined, further, _LEFT_HALF_CELLS)
+        kept = [before + k for k in kept] + left
         expected, _ = count_visible_markers(
             alone.camera, alone.table.surface, row, refined, _FRAME_MARGIN_PX
         )
         if len(kept) > len(best[2]) and 2 * len(kept) >= expected:
-            best = seen, refined, [before + k for k in kept]
+            best = seen, refined, kept
     return best
 
 

@@ -165,3 +165,46 @@ def test_corners_that_cannot_be_fitted_are_kept_with_the_error_of_a_contour():
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     quads = np.array([300.0 + 10.0 * square, 200.0 + 100.0 * square])
     assert corners.coarse_sigma_px(camera, quads) == pytest.approx([1.0, 6.0])
+
+
+def test_neighbours_of_one_far_marker_are_found_and_those_of_a_false_id_are_not(monkeypatch):
+    """Its corners are off by half a pixel, which moves the others by more than a cell."""
+    scene = Scene(target_model("servicer"))
+    marker = scene.model.markers[0]
+    face = rotations.conjugate(np.array(marker.q_trf_marker_wxyz))
+    tilt = rotations.exp([0.5, 0.3, 0.2])
+    q, position = (
+        rotations.multiply(rotations.multiply(tilt, FACING), face),
+        np.array([0.1, 0, 4.8]),
+    )
+    image = scene.image(position, q)
+    px = scene.camera.project(rotations.rotate(q, marker.corners_trf_m()) + position)
+    px += np.array([[0.5, -0.5], [-0.5, 0.4], [0.5, 0.5], [-0.4, -0.5]])
+    for number, seen in ((marker.id, True), (scene.model.markers[1].id, False)):
+        only = detect.Detections(np.array([number]), px[None])
+        monkeypatch.setattr(detect, "detect", lambda *_, only=only: only)
+        result = scene.perception.estimate(image)
+        assert bool(result.solutions) == seen
+        if seen:
+            assert {0, 1, 2, 3} <= {*result.marker_ids.tolist()}
+            assert np.linalg.norm(result.solutions[0].position_irf_m - position) < 0.1
+
+
+@pytest.mark.parametrize(("distance_m", "factor"), [(4.0, 1.0), (1.0, 0.6)])
+def test_small_residuals_do_not_reduce_the_covariance_of_small_markers(distance_m, factor):
+    camera, table = Camera.from_hfov(640, 480, HFOV), pnp.MarkerTable.of(target_model("servicer"))
+    q, position = rotations.multiply(rotations.exp([0.4, 0.3, 0.0]), FACING), [0.0, 0.0, distance_m]
+    rows = np.argsort(rotations.rotate(q, table.normals)[:, 2], kind="stable")[:4]
+    px = camera.project_ideal(rotations.rotate(q, table.corners[rows]) + position)
+    errors = CornerErrors.even(np.full(4, 0.1))
+    solutions, _ = pnp.solve(camera, table, rows, px, errors)
+    pose = pnp.PoseInCamera(np.array(position), rotations.to_matrix(q))
+    stated = pnp.pose_covariance(camera, table.corners[rows], px, errors, pose)
+    assert stated is not None
+    assert solutions[0].covariance == pytest.approx(factor * stated[0], rel=1e-3, abs=1e-12)
+
+
+def test_the_place_of_a_marker_tells_how_far_its_corners_move_together():
+    white = CornerErrors.of_places(np.array([0.5])).whitening[0]
+    assert white @ np.tile([1.0, -0.5], 4) == pytest.approx([2.0, -1.0, *np.zeros(6)])
+    assert white @ [1.0, 0.0, -1.0, 0.0, 1.0, 0.0, -1.0, 0.0] == pytest.approx(np.zeros(8))

@@ -120,6 +120,15 @@ class CornerErrors:
         sigma = np.asarray(sigma_px, dtype=float)[:, None, None]
         return CornerErrors(np.eye(8) / sigma, np.zeros((len(sigma), 8)))
 
+    @staticmethod
+    def of_places(sigma_px: Array) -> CornerErrors:
+        """Return those of markers of which only the place is known, to ``sigma_px`` (n,) along both
+        axes: four corners move together.
+        """
+        white = np.zeros((len(sigma_px), 8, 8))
+        white[:, 0, 0::2] = white[:, 1, 1::2] = 0.25 / np.asarray(sigma_px, dtype=float)[:, None]
+        return CornerErrors(white, np.zeros((len(white), 8)))
+
     def part(self, which: NDArray[np.bool_] | NDArray[np.intp] | list[int]) -> CornerErrors:
         """Return those of the markers selected by ``which``."""
         return CornerErrors(self.whitening[which], self.common[which])

@@ -17,7 +17,7 @@ from . import baseline as paper
 from . import corners, detect, pnp
 from .corners import CornerErrors
 from .pnp import FurtherMarkers, TargetPose
-from .reading import CellReader
+from .reading import PLACE_CELLS, CellReader
 from .refine import PoseInCamera
 
 _ENOUGH = 6
@@ -83,10 +83,14 @@ class _Further:
         self._perception, self._image, self._coarse = perception, image, coarse
         self._rows, self._px, _ = _NO_COARSE
 
-    def markers(self, pose: PoseInCamera, used: NDArray[np.intp]) -> FurtherMarkers:
-        """Return the markers that the image shows beside the ``used`` rows at a pose."""
+    def markers(
+        self, pose: PoseInCamera, used: NDArray[np.intp], reach: int
+    ) -> tuple[int, FurtherMarkers]:
+        """Return the number of markers returned before, and those that the image shows beside the
+        ``used`` rows at a pose, up to ``reach`` half cells away.
+        """
         by = self._perception
-        read = by.reader.read(self._image, by.camera, pose, used)
+        read = by.reader.read(self._image, by.camera, pose, used, reach)
         rows, (coarse, px, errors) = read.rows, self._coarse
         new = ~np.isin(coarse, used)
         coarse, px, errors = coarse[new], px[new], errors.part(new)
@@ -98,8 +102,15 @@ class _Further:
             coarse = np.concatenate([rows, coarse[left]])
             px = np.concatenate([fitted.corners_px, px[left]])
             errors = fitted.errors.followed_by(errors.part(left))
-        self._rows, self._px = coarse, px
-        return FurtherMarkers(coarse, px, errors)
+        before, count = len(self._rows), len(coarse)
+        if reach:
+            at = read.corners_px[read.rows]
+            coarse, px = np.concatenate([coarse, read.rows]), np.concatenate([px, at])
+            cell_px = corners.mean_side_px(at) / by.reader.cells
+            errors = errors.followed_by(CornerErrors.of_places(PLACE_CELLS * cell_px))
+        self._rows = np.concatenate([self._rows, coarse])
+        self._px = np.concatenate([self._px, px])
+        return before, FurtherMarkers(coarse, px, errors, range(count, len(coarse)))
 
     def after(self, rows: NDArray[np.intp], px: Array) -> tuple[NDArray[np.intp], Array]:
         """Return rows and corners of detections, followed by those of `markers`."""

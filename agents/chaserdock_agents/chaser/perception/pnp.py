@@ -22,7 +22,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel, clear_margin_m
 from numpy.typing import NDArray
 
-from .corners import CornerErrors
+from .corners import CornerErrors, mean_side_px
 from .refine import PoseInCamera, refine, residual_of, rotation_matrix
 from .views import count_visible_markers, marker_errors, squared_errors
 
@@ -35,6 +35,9 @@ _PRIOR_RESIDUALS = 4.0
 # Least factor of the stated variance by residuals: these do not show what all markers of an image
 # have in common. Larger: too large covariances; smaller: too small ones of many small markers.
 _LEAST_FACTOR = 0.6
+# The same if the largest marker has a shorter side, px, which is four pixels a cell: the lines of
+# such markers err alike, by pixels as wide as a quarter of a cell (docs/evidence/estimation.md).
+_SMALL_SIDE_PX, _LEAST_FACTOR_SMALL = 24.0, 1.0
 # Least cosine of the viewing angle of a single marker: at a more grazing angle its tilt is poorly
 # determined, with an optimistic covariance.
 MIN_SINGLE_COSINE = 0.25
@@ -63,6 +66,10 @@ _WRONG_SIDE_SQUARE, _WRONG_SIDE_WEIGHT, _SUSPECTS, _MOST_WRONG_SIDES = 16.0, 0.0
 # A single marker counts as a false id if this many others should be as visible and none is
 # detected.
 _MAX_MISSING = 2
+# Half cells around the place where a pose puts a marker, within which it is looked for: the
+# neighbours of a single one (a corner that is wrong by a pixel moves them by two), and those that
+# are left when a pose is known. Larger: more time, and more false ones.
+_ALONE_HALF_CELLS, _LEFT_HALF_CELLS = 4, 1
 # Distance from the image's border, px, within which a marker need not be visible: its white border,
 # which the detector needs, may be cut. Larger: fewer false ids are recognized; smaller: right ones
 # are rejected.
@@ -157,6 +164,14 @@ class _DetectedMarkers:
         """
         return _plane_poses(self)
 
+    def followed_by(self, others: FurtherMarkers) -> _DetectedMarkers:
+        which = np.concatenate([self.which, others.which])
+        pixels = np.concatenate([self.pixels, others.corners_px])
+        errors = self.errors.followed_by(others.errors)
+        return _DetectedMarkers(
+            self.camera, self.table, which, self.table.corners[which], pixels, errors
+        )
+
     def part(self, of: list[int]) -> _DetectedMarkers:
         if len(of) == len(self.which):  # indices are ascending and distinct: all of them
             return self
@@ -174,12 +189,19 @@ class _DetectedMarkers:
 class FurtherMarkers:
     """k markers that fewer or worse corners than those of a pose show, to be added to it.
 
-    ``which`` (k,), ``corners_px`` (k, 4, 2), ideal, and ``errors`` as for `solve`.
+    ``which`` (k,), ``corners_px`` (k, 4, 2), ideal, and ``errors`` as for `solve`. ``read``:
+    indices of those at the places where their cells were read.
     """
 
     which: Indices
     corners_px: Array
     errors: CornerErrors
+    read: range
+
+
+Further = Callable[[PoseInCamera, Indices, int], tuple[int, FurtherMarkers]]
+"""Returns the markers beside given rows that an image shows at a pose, each up to so many half
+cells away, and the number of those returned before."""
 
 
 def solve(
@@ -188,13 +210,13 @@ def solve(
     which: Indices,
     corners_ideal_px: Array,
     errors: CornerErrors,
-    further: Callable[[PoseInCamera, Indices], FurtherMarkers] | None = None,
+    further: Further | None = None,
 ) -> tuple[tuple[TargetPose, ...], Indices]:
     """Return the poses, best first, that explain the detections, and the indices of those used.
 
     ``which`` (n,): row of ``table`` of each detection; a row may occur more than once.
     ``corners_ideal_px`` (n, 4, 2). ``errors``: of their corners. ``further``: markers to be added
-    to a pose from given rows of ``table``; their indices follow those of the detections.
+    to a pose; their indices follow those of the detections.
 
     Returns no pose and no indices if nothing is explained well, if a single marker is seen at a
     grazing angle or without others that its pose would show, or if two equally large groups of
@@ -224,13 +246,13 @@ def solve(
 
     seen = first = seen.part(used)
     if further is not None:
-        seen, pose, added = _with_further(first, pose, further(pose, first.which))
-        if len(used) == 1 and not added:  # its other pose may show them
-            for other in _other_than(pose, first.plane_poses)[:1]:
-                refined = _refined(first, other)
-                if refined is not None:
-                    again = _with_further(first, refined, further(refined, first.which))
-                    seen, pose, added = again if again[2] else (seen, pose, added)
+        seen, pose, added = _with_further(first, pose, further, 0)
+        if len(used) == 1 and not added:
+            seen, pose, added = _with_neighbours(first, pose, further)
+            first = seen
+        else:
+            seen, pose, left = _with_further(seen, pose, further, _LEFT_HALF_CELLS)
+            added += left
         used = used + [len(which) + k for k in added]
     seen, pose = _without_wrong_sides(seen, pose)
     poses = [pose]
@@ -423,28 +445,64 @@ def _seen_twice(seen: _DetectedMarkers, used: list[int]) -> set[int]:
 
 
 def _with_further(
-    seen: _DetectedMarkers, pose: PoseInCamera, further: FurtherMarkers
+    seen: _DetectedMarkers, pose: PoseInCamera, further: Further, half_cells: int
 ) -> tuple[_DetectedMarkers, PoseInCamera, list[int]]:
     """Return the markers of a pose with those ``further`` ones that agree with it, the pose of all,
-    and the indices of these in ``further``.
+    and the indices of these among all further ones.
     """
-    table, which = seen.table, further.which
+    before, more = further(pose, seen.which, half_cells)
+    joined, pose, kept = _with_agreeing(seen, pose, more)
+    return joined, pose, [before + k for k in kept]
+
+
+def _with_agreeing(
+    seen: _DetectedMarkers, pose: PoseInCamera, further: FurtherMarkers
+) -> tuple[_DetectedMarkers, PoseInCamera, list[int]]:
+    """Return the same with indices in ``further``."""
+    which, n = further.which, len(seen.which)
     if not len(which):
         return seen, pose, []
-    points, normals = table.corners[which], table.normals[which]
+    points, normals = seen.table.corners[which], seen.table.normals[which]
     error = marker_errors(seen.camera, points, normals, further.corners_px, pose)
     sigma_px = np.sqrt(8.0 / np.square(further.errors.whitening).sum(axis=(1, 2)))
     gate = np.clip(_FINE_GATE_SIGMAS * sigma_px, _FINE_GATE_PX, _COARSE_GATE_PX)
-    near = [e if e < g else math.inf for e, g in zip(error, gate.tolist(), strict=True)]
-    kept = _one_of_each(which.tolist(), near, _COARSE_GATE_PX)
+    near = [
+        # A fitted marker comes before the same one at the place where it was read.
+        e + (_COARSE_GATE_PX if k in further.read else 0.0) if e < g else math.inf
+        for k, (e, g) in enumerate(zip(error, gate.tolist(), strict=True))
+    ]
+    kept = _one_of_each(which.tolist(), near, 2.0 * _COARSE_GATE_PX)
     if not kept:
         return seen, pose, []
-    rows = np.concatenate([seen.which, which[kept]])
-    pixels = np.concatenate([seen.pixels, further.corners_px[kept]])
-    errors = seen.errors.followed_by(further.errors.part(kept))
-    joined = _DetectedMarkers(seen.camera, table, rows, table.corners[rows], pixels, errors)
+    joined = seen.followed_by(further).part([*range(n), *(n + k for k in kept)])
     refined = _refined(joined, pose)
     return (seen, pose, []) if refined is None else (joined, refined, kept)
+
+
+def _with_neighbours(
+    alone: _DetectedMarkers, pose: PoseInCamera, further: Further
+) -> tuple[_DetectedMarkers, PoseInCamera, list[int]]:
+    """Return a single marker with its neighbours, the pose of all, and the indices of the
+    neighbours among ``further`` ones.
+
+    A pose of one small marker puts others some of their cells away from where they are. At least
+    half of the markers that should be as visible must be found there: others are a false id's.
+    """
+    best, row = (alone, pose, list[int]()), int(alone.which[0])
+    for candidate in (pose, *_other_than(pose, alone.plane_poses)[:1]):
+        before, more = further(candidate, alone.which, _ALONE_HALF_CELLS)
+        found = _consensus(alone.followed_by(more)) if len(more.which) else None
+        if found is None or found[1][0] != 0:
+            continue
+        seen, refined, kept = _with_agreeing(alone, found[0], more)
+        seen, refined, left = _with_further(seen, refined, further, _LEFT_HALF_CELLS)
+        kept = [before + k for k in kept] + left
+        expected, _ = count_visible_markers(
+            alone.camera, alone.table.surface, row, refined, _FRAME_MARGIN_PX
+        )
+        if len(kept) > len(best[2]) and 2 * len(kept) >= expected:
+            best = seen, refined, kept
+    return best
 
 
 def _without_wrong_sides(
@@ -507,8 +565,10 @@ def _solutions(seen: _DetectedMarkers, poses: list[PoseInCamera]) -> list[Target
     if not found:
         return []
     found.sort(key=lambda item: item[0])
-    least, free = found[0][0], 8 * len(seen.which) - 6
-    factor = max((_PRIOR_RESIDUALS + least) / (_PRIOR_RESIDUALS + free), _LEAST_FACTOR)
+    least, free = found[0][0], int(seen.errors.whitening.any(axis=2).sum()) - 6
+    small = float(mean_side_px(seen.pixels).max()) < _SMALL_SIDE_PX
+    floor = _LEAST_FACTOR_SMALL if small else _LEAST_FACTOR
+    factor = max((_PRIOR_RESIDUALS + least) / (_PRIOR_RESIDUALS + free), floor)
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     return [
         TargetPose(

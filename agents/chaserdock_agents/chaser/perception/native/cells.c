@@ -58,18 +58,37 @@ static double correlation(const Image *p, const ReadLimits *limits, const double
     return step * sqrt_of(share / variance);
 }
 
+/* Moves a marker's corners `px` (4, 2) to the place, of those up to `reach` half cells away along
+ * both axes of the image, where its cells correlate best; return that correlation. */
+static double located(const Image *p, const ReadLimits *limits, double *px, const uint8_t *white,
+                      int64_t cells, int64_t reach) {
+    double across[2], down[2], best = 0.0, at[2] = {0.0};
+    for (int k = 0; k < 2; k++) across[k] = px[4 + k] - px[k], down[k] = px[6 + k] - px[2 + k];
+    double area = 0.5 * abs_of(across[0] * down[1] - across[1] * down[0]);
+    double step = 0.5 * sqrt_of(area) / (double)cells;
+    for (int64_t i = -reach; i <= reach; i++)
+        for (int64_t j = -reach; j <= reach; j++) {
+            double moved[8];
+            for (int k = 0; k < 8; k++) moved[k] = px[k] + step * (double)(k & 1 ? j : i);
+            double found = correlation(p, limits, moved, white, cells);
+            if (found > best) best = found, at[0] = step * (double)i, at[1] = step * (double)j;
+        }
+    for (int k = 0; k < 8; k++) px[k] += at[k & 1];
+    return best;
+}
+
 /* Reads the markers that a pose shows: `surface` (6 m, 3), rotated into IRF axes: the 4 corners of
  * each of m markers, their centres and their normals; `position` of the target, m; `margin` (m): as
  * for `refine_corners`. `white` (m, cells, cells): 1 for white cells; `skip` (m): markers not to be
- * read. Output: `px` (m, 4, 2), ideal; `finest` (m): width of the finer of cell and border, px, NaN
+ * read; `reach`: as for `located`. Output: `px` (m, 4, 2), ideal; `finest` (m): width of the finer of cell and border, px, NaN
  * for a marker that does not face the camera; `found` (m): correlation with its cells, 0 for those
  * that are not read. */
 EXPORT void NAME(read_markers)(const uint8_t *image, int64_t height, int64_t width,
                                const double *camera, const Lens *lens, const ReadLimits *limits,
                                const double *surface, const double *position,
                                const double *margin, int64_t markers, const uint8_t *white,
-                               int64_t cells, const uint8_t *skip, double *px, double *finest,
-                               double *found) {
+                               int64_t cells, const uint8_t *skip, int64_t reach, double *px,
+                               double *finest, double *found) {
     Image p = {image, height, width, camera, lens, NULL};
     const double *centres = surface + 12 * markers, *normals = surface + 15 * markers;
     for (int64_t m = 0; m < markers; m++) {
@@ -96,6 +115,6 @@ EXPORT void NAME(read_markers)(const uint8_t *image, int64_t height, int64_t wid
         double extent = least_extent(corners);
         finest[m] = extent * min_of(margin[m], 1.0 / (double)cells);
         if (inside && !skip[m] && extent >= limits->cell_px * (double)cells)
-            found[m] = correlation(&p, limits, corners, white + m * cells * cells, cells);
+            found[m] = located(&p, limits, corners, white + m * cells * cells, cells, reach);
     }
 }

@@ -382,15 +382,18 @@ def devices() -> None:
     diagram(
         "devices",
         {
-            "camera": Box(0, 1.2, "camera", "real", 0.7),
-            "pose": Box(0, 0.6, "odometry,\nmotion capture", "real", 0.7, 0.5),
-            "robot": Box(0, 0.0, "robot", "real", 0.7),
-            "gateway": Box(2.4, 0.6, "chaserdock\ngateway", "real", 0.8, 0.75),
+            "camera": Box(0, 1.8, "camera", "real", 0.7),
+            "pose": Box(0, 1.2, "odometry,\nmotion capture", "real", 0.7, 0.5),
+            "robot": Box(0, 0.6, "robot", "real", 0.7),
+            "latch": Box(0, 0.0, "latch", "real", 0.7),
+            "gateway": Box(2.4, 0.9, "chaserdock\ngateway", "real", 0.8, 0.75),
         },
         [
             ("camera", "gateway", "ros2:", 0.0),
             ("pose", "gateway", "ros2:  mavlink:", 0.0),
             ("gateway", "robot", "ros2:  px4:  mavlink:", 0.0),
+            ("gateway", "latch", "ros2:", 0.0),
+            ("latch", "gateway", "", 0.0),
         ],
     )
 

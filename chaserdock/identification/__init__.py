@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of a robot from a recorded run: mass properties, thrusts and delay."""
+"""Identification of a robot from a recorded run: mass properties, thrusts, delay and lag."""

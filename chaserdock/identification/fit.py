@@ -27,7 +27,7 @@ from .motion_filter import (
     actuation_of,
     commanded_over,
 )
-from .recorded import RecordedRobot, recorded_robot
+from .recorded import Latency, RecordedRobot, recorded_robot
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,10 @@ class FitParameters:
     share: float = 1.0
     # Standard deviation of a nozzle's direction, rad: a degree, as drawings and mounts allow.
     nozzle_rad: float = 0.0175
-    # Standard deviations of the delay, s, and of constant force, N, and torque, N m: beyond all
-    # that a robot which flies at all can have.
+    # Standard deviations of the delay, s, of the square of the lag's time constant, s^2, and of
+    # constant force, N, and torque, N m: beyond all that a robot which flies at all can have.
     delay_s: float = 0.3
+    lag_s2: float = 0.01
     force_N: float = 1.0
     torque_N_m: float = 0.1
     # Delays, s, from which the best is improved: pulses last 0.1 s.
@@ -164,17 +165,21 @@ class _Fit:
             np.array([*moments, 0.0, 0.0, 0.0]),
             np.zeros(6),
             0.0,
+            0.0,
             np.zeros(3),
         )
         self._prior = _prior(actuation, body.size_m, moments, errors.gyro_bias_rad_s)
+        self._lag = len(self._prior) - 4  # row of the square of the lag
+        self._prior[self._lag] = _FIT.lag_s2 if robot.actuators.lags else 0.0
         own = np.diag(robot.motion.noise)
         floors = np.repeat(_FIT.floors, 3)
         wander = np.zeros(12)
         wander[:3] = 2.0 * errors.position_drift_m**2 / errors.position_drift_time_s
         wander[6:9] = 2.0 * errors.attitude_drift_rad**2 / errors.attitude_drift_time_s
         self._least = np.maximum(np.sqrt(own) * 0.1, floors)
-        self._noise = Noise(robot.motion.noise + np.diag(floors**2), wander, 0.0)
-        self._commanded: tuple[float, Commanded] | None = None
+        self._stated = robot.motion.noise + np.diag(floors**2)
+        self._noise = Noise(self._stated, wander, 0.0)
+        self._commanded: tuple[Latency, Commanded] | None = None
 
     def converged(self) -> tuple[RobotParameters, Pass, Noise]:
         """Return the likeliest parameters, the last pass, and the noise."""
@@ -200,30 +205,49 @@ class _Fit:
     def _iterated(self, parameters: RobotParameters) -> tuple[RobotParameters, Pass]:
         for _ in range(_FIT.passes):
             found = self._run(parameters, self._noise)
-            parameters = _moved(parameters, found.change)
-            steps = np.abs(found.change) / np.maximum(_sigmas(found.covariance), 1e-300)
+            before, parameters = (
+                parameters.vector,
+                _moved(parameters, self._possible(parameters, found)),
+            )
+            change = np.abs(parameters.vector - before)
+            steps = change / np.maximum(_sigmas(found.covariance), 1e-300)
             if steps.max() < _FIT.near_sigmas:
                 self._noise = self._noise_about(parameters)
             if steps.max() < _FIT.settled_sigmas:
                 break
         return parameters, self._run(parameters, self._noise)
 
+    def _possible(self, parameters: RobotParameters, found: Pass) -> Array:
+        """Return the change (P,) of a pass, or the likeliest without a lag where its square would
+        become negative.
+        """
+        change, k = found.change, self._lag
+        short = -(parameters.lag_s2 + change[k])
+        if short <= 0.0:
+            return change
+        return change + found.covariance[:, k] * (short / found.covariance[k, k])
+
     def _noise_about(self, parameters: RobotParameters) -> Noise:
-        """Return the noise that the residuals about known parameters show."""
+        """Return the noise that the residuals about known parameters show, as stated where they do
+        not.
+        """
         run = MotionFilter(self._actuation, self._mass_kg, parameters, self._noise).run
         none = np.zeros(len(self._prior))
-        found = run(self._robot.motion, self._commanded_by(parameters.delay_s), none, none)
-        return replace(self._noise, measured=self._positive(found.measured))
+        found = run(self._robot.motion, self._commanded_by(parameters), none, none)
+        shown = np.where(np.isnan(found.measured), self._stated, found.measured)
+        return replace(self._noise, measured=self._positive(shown))
 
     def _run(self, parameters: RobotParameters, noise: Noise) -> Pass:
         start = self._nominal.vector - parameters.vector
         run = MotionFilter(self._actuation, self._mass_kg, parameters, noise).run
-        return run(self._robot.motion, self._commanded_by(parameters.delay_s), start, self._prior)
+        return run(self._robot.motion, self._commanded_by(parameters), start, self._prior)
 
-    def _commanded_by(self, delay_s: float) -> Commanded:
-        if self._commanded is None or self._commanded[0] != delay_s:
+    def _commanded_by(self, parameters: RobotParameters) -> Commanded:
+        latency = parameters.latency
+        if self._commanded is None or self._commanded[0] != latency:
             time_ns = self._robot.motion.time_ns
-            self._commanded = delay_s, commanded_over(self._robot.actuators, time_ns, delay_s)
+            found = commanded_over(self._robot.actuators, time_ns, parameters)
+            self._commanded = latency, found
         return self._commanded[1]
 
     def _positive(self, covariance: Array) -> Array:
@@ -248,7 +272,7 @@ def _prior(
     pushes = np.repeat([_FIT.force_N, _FIT.torque_N_m], 3) * actuation.axes
     centre = held * max(size_m) / 2.0
     return np.concatenate(
-        [gains, centre, inertia, pushes, [_FIT.delay_s], np.full(3, gyro_bias_rad_s)]
+        [gains, centre, inertia, pushes, [_FIT.delay_s, 0.0], np.full(3, gyro_bias_rad_s)]
     )
 
 
@@ -274,8 +298,8 @@ def _scaled(
     found: Pass,
     weighed: bool,
 ) -> tuple[Array, Array]:
-    """Return mass, gains along the stated directions, centre, inertia, push and delay (Q,), and
-    their covariance.
+    """Return mass, gains along the stated directions, centre, inertia, push, delay and square of
+    the lag (Q,), and their covariance.
 
     The filter's unit of force is divided by the mean gain, unless the mass is weighed.
     """
@@ -289,7 +313,7 @@ def _scaled(
     if used and not weighed:
         scale = float(parameters.gains[used].mean())
         by_gain[used] = 1.0 / len(used)
-    rows = [*along, *range(n, n + 16)]
+    rows = [*along, *range(n, n + 17)]
     kept = np.array([*along, *range(n + 3, n + 15)])
     values = parameters.vector.copy()
     jacobian = np.eye(size)
@@ -307,7 +331,7 @@ def _quantities(
     thrusters = body.thrusters if body.actuation == "thrusters" else ()
     count, axes = len(actuation.along), actuation.axes
     stated_N = np.array([t.thrust_N for t in thrusters]) if thrusters else np.ones(1)
-    scales = np.concatenate([[1.0], stated_N, np.ones(16)])
+    scales = np.concatenate([[1.0], stated_N, np.ones(17)])
     values, sigma = values * scales, sigma * scales
     moment = float(values[1 + count + 3 : 1 + count + 6].mean())
     tick_s = 1.0 / robot.scenario.time.rate_hz
@@ -336,6 +360,14 @@ def _quantities(
         elif weighed:
             add("force and torque, share", "", 1, 1.0, float(values[1]))
     add("delay", "s", row + 15, 0.0, tick_s)
+    if robot.actuators.lags:
+        square = max(0.0, float(values[row + 16]))
+        lag_s = math.sqrt(square)
+        longest_s = float(values[row + 15]) + float(sigma[row + 15]) / _FIT.known_share
+        # More than the mean delay is no lag, but an error of the odometry that looks like one.
+        known = bool(sigma[row + 16] < _FIT.known_share * square) and lag_s < longest_s
+        lag_sigma_s = float(sigma[row + 16]) / (2.0 * lag_s) if known else math.inf
+        out.append(IdentifiedQuantity("lag", "s", 0.0, lag_s, lag_sigma_s, known))
     for k in np.flatnonzero(axes).tolist():
         name, unit = ("force", "N") if k < 3 else ("torque", "N m")
         add(f"{name} {'xyz'[k % 3]}", unit, row + 9 + k, 0.0, math.inf)

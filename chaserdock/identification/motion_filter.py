@@ -21,7 +21,7 @@ from chaserdock_models.rigid_body import MAX_STEP_S, free_rotation
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.scenario.bodies import Body
 
-from .recorded import MeasuredMotion, Pulses, Wrenches
+from .recorded import Latency, MeasuredMotion, Pulses, Wrenches
 
 INERTIA_ROWS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Row and column of the identified elements of the inertia tensor, in their order."""
@@ -30,6 +30,15 @@ for _k, (_i, _j) in enumerate(INERTIA_ROWS):
     _BASIS[_k, _i, _j] = _BASIS[_k, _j, _i] = 1.0
 _DELAY_STEP_S = 0.004
 """Step, s, of the derivative by the delay: short against a pulse, long against the valves' rise."""
+_LAG_STEP_S2 = 1e-4
+"""Step, s^2, of the derivative by the square of the lag's time constant: of 10 ms, which is short
+against a tick, and longer than what a run can tell from none.
+"""
+_SHOWN_SIGMAS = 3.0
+"""Standard deviations, of innovations that have no noise of the odometry, by which a noise must
+exceed zero to be told. Fewer: what pulses scatter hides it, and it is taken for zero; more: short
+runs keep the stated one.
+"""
 _X, _V, _Q, _W = (slice(k, k + 3) for k in (0, 3, 6, 9))
 
 
@@ -81,8 +90,10 @@ def actuation_of(body: Body) -> Actuation:
 @dataclass(frozen=True, eq=False)
 class RobotParameters:
     """Parameters as one vector: ``gains`` (C,), ``centre_m`` (3,) CRF, ``inertia`` (6,) about it,
-    ``push`` (6,): constant force and torque at the origin of CRF in its axes, ``delay_s``,
-    ``bias_rad_s`` (3,) of the rate. Thrusts, inertia and push are in units of the mass.
+    ``push`` (6,): constant force and torque at the origin of CRF in its axes, ``delay_s``: mean
+    time from command to force, of which the square root of ``lag_s2`` is the time constant of a
+    first-order lag, ``bias_rad_s`` (3,) of the rate. Thrusts, inertia and push are in units of the
+    mass.
     """
 
     gains: Array
@@ -90,6 +101,7 @@ class RobotParameters:
     inertia_kg_m2: Array
     push: Array
     delay_s: float
+    lag_s2: float
     bias_rad_s: Array
 
     @property
@@ -101,7 +113,7 @@ class RobotParameters:
                 self.centre_m,
                 self.inertia_kg_m2,
                 self.push,
-                [self.delay_s],
+                [self.delay_s, self.lag_s2],
                 self.bias_rad_s,
             ]
         )
@@ -109,8 +121,14 @@ class RobotParameters:
     @classmethod
     def of(cls, vector: Array) -> RobotParameters:
         """Return the parameters in a vector (P,)."""
-        gains, rest = vector[:-19], vector[-19:]
-        return cls(gains, rest[:3], rest[3:9], rest[9:15], float(rest[15]), rest[16:])
+        gains, rest = vector[:-20], vector[-20:]
+        late = float(rest[15]), float(rest[16])
+        return cls(gains, rest[:3], rest[3:9], rest[9:15], *late, rest[17:])
+
+    @property
+    def latency(self) -> Latency:
+        """Return the time from command to force."""
+        return latency_of(self.delay_s, self.lag_s2)
 
     @property
     def tensor(self) -> Array:
@@ -121,39 +139,55 @@ class RobotParameters:
 @dataclass(frozen=True, eq=False)
 class Commanded:
     """What actuators were told to give in each interval between two odometries: impulses (K - 1, a)
-    with their first moments, the derivatives of both by the delay, and impulses and moments of n
-    equal parts of each interval (K - 1, n, a).
+    with their first moments, the derivatives of both by delay and lag (K - 1, a, 2), impulses and
+    moments of n equal parts of each interval (K - 1, n, a), and the impulses (K - 1, a) by whose
+    share the given ones scatter.
     """
 
     impulses: Array
     moments: Array
-    impulses_by_delay: Array
-    moments_by_delay: Array
+    impulses_by_latency: Array
+    moments_by_latency: Array
     impulses_of_parts: Array
     moments_of_parts: Array
+    scattered: Array
 
 
-def commanded_over(actuators: Pulses | Wrenches, time_ns: IntArray, delay_s: float) -> Commanded:
-    """Return what actuators were told to give between successive times (K,), ``delay_s`` late."""
-    parts, h = (
-        max(1, math.ceil(float(np.median(np.diff(time_ns))) * 1e-9 / MAX_STEP_S)),
-        _DELAY_STEP_S,
-    )
+def latency_of(delay_s: float, lag_s2: float) -> Latency:
+    """Return the latency with this mean and this square of the time constant of its lag."""
+    lag_s = math.sqrt(max(0.0, lag_s2))  # rounding may leave less
+    return Latency(delay_s - lag_s, lag_s)
+
+
+def commanded_over(
+    actuators: Pulses | Wrenches, time_ns: IntArray, parameters: RobotParameters
+) -> Commanded:
+    """Return what actuators were told to give between successive times (K,), later by the latency
+    of ``parameters``.
+    """
+    parts = max(1, math.ceil(float(np.median(np.diff(time_ns))) * 1e-9 / MAX_STEP_S))
     shares = np.arange(parts) / parts
     fine_ns = (time_ns[:-1, None] + shares * np.diff(time_ns)[:, None]).ravel().astype(np.int64)
-    shape = (len(time_ns) - 1, parts, -1)
-    u, m = actuators.over(np.append(fine_ns, time_ns[-1]), (delay_s,))
+    shape, own = (len(time_ns) - 1, parts, -1), parameters.latency
+    u, m = actuators.over(np.append(fine_ns, time_ns[-1]), (own,))
     of_parts, moments_of_parts = u[0].reshape(shape), m[0].reshape(shape)
-    u, m = actuators.over(time_ns, (delay_s, delay_s + h, delay_s - h))
-    by_delay = (u[1] - u[2]) / (2.0 * h), (m[1] - m[2]) / (2.0 * h)
-    return Commanded(u[0], m[0], *by_delay, of_parts, moments_of_parts)
+    delay_s, lag_s2, h = parameters.delay_s, parameters.lag_s2, _DELAY_STEP_S
+    lags_s2 = max(0.0, lag_s2 - _LAG_STEP_S2), lag_s2 + _LAG_STEP_S2
+    around = [latency_of(delay_s + d, lag_s2) for d in (-h, h)]
+    around += [latency_of(delay_s, v) for v in lags_s2] if actuators.lags else []
+    u, m = actuators.over(time_ns, (own, *around))
+    by_delay = [(x[2] - x[1]) / (2.0 * h) for x in (u, m)]
+    by_lag = [(x[-1] - x[-2]) / (lags_s2[1] - lags_s2[0]) for x in (u, m)]
+    impulses, moments = (np.stack(both, axis=-1) for both in zip(by_delay, by_lag, strict=True))
+    scattered = actuators.scattered(time_ns, delay_s)
+    return Commanded(u[0], m[0], impulses, moments, of_parts, moments_of_parts, scattered)
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
     """``measured`` (12, 12): covariance of position, velocity, attitude and rate. ``wander`` (12,):
-    variance per second of a random walk in them. ``scatter_share``: of each thruster's impulse in
-    an interval.
+    variance per second of a random walk in them. ``scatter_share``: of the impulse of each pulse or
+    command.
     """
 
     measured: Array
@@ -165,7 +199,7 @@ class Noise:
 class Pass:
     """Result of a pass: ``change`` (P,) of the parameters with its ``covariance``, log-likelihood,
     innovations (M, 12), and the covariance (12, 12) of the measurement noise that they show if the
-    parameters count as known.
+    parameters count as known; NaN where they do not.
     """
 
     change: Array
@@ -213,7 +247,7 @@ class MotionFilter:
         self._gains = slice(12, n)
         self._centre, self._inertia = slice(n, n + 3), slice(n + 3, n + 9)
         self._push = slice(n + 9, n + 15)
-        self._delay, self._bias = slice(n + 15, n + 16), slice(n + 16, n + 19)
+        self._latency, self._bias = slice(n + 15, n + 17), slice(n + 17, n + 20)
 
     def run(self, motion: MeasuredMotion, commanded: Commanded, start: Array, prior: Array) -> Pass:
         """Filter a run. ``start`` (P,): mean of the parameters' error, ``prior`` (P,): its standard
@@ -234,13 +268,22 @@ class MotionFilter:
             spreads.append(spread)
             log_likelihood += likelihood
         found, predicted = np.array(innovations), np.array(spreads)
-        own = np.diag(self._noise.measured)
-        settled = (np.diagonal(predicted, axis1=1, axis2=2) < own).all(axis=1)
-        settled = settled if settled.any() else np.ones(len(found), dtype=bool)
-        shown = (found[settled, :, None] * found[settled, None, :] - predicted[settled]).mean(
-            axis=0
-        )
+        shown = self._shown(found, predicted)
         return Pass(s.mean, s.covariance[12:, 12:], log_likelihood, found, shown)
+
+    def _shown(self, found: Array, predicted: Array) -> Array:
+        """Return the noise (12, 12) that innovations (M, 12) show where their predictions (M, 12,
+        12) are more certain than it; NaN where they do not tell it.
+        """
+        settled = np.diagonal(predicted, axis1=1, axis2=2) < np.diag(self._noise.measured)
+        both = settled[:, :, None] & settled[:, None, :]
+        count = both.sum(axis=0)
+        least = np.maximum(count, 1)
+        squares = np.where(both, found[:, :, None] * found[:, None, :], 0.0).sum(axis=0) / least
+        expected = np.where(both, predicted, 0.0).sum(axis=0) / least
+        shown, doubt = squares - expected, _SHOWN_SIGMAS * expected * np.sqrt(2.0 / least)
+        told = np.diag(shown) > np.diag(doubt)
+        return np.where((count > 1) & told[:, None] & told, shown, np.nan)
 
     def _started(self, z: Array, mean: Array, covariance: Array) -> _State:
         """Return the state of a stretch that begins with a measurement (13,)."""
@@ -260,7 +303,7 @@ class MotionFilter:
         covariance[:12, :12] = moved_by @ f.T
         covariance[range(12), range(12)] += self._noise.wander * dt
         if self._noise.scatter_share:
-            scattered = (self._actuation.scattered @ commanded.impulses[k]).T
+            scattered = (self._actuation.scattered @ commanded.scattered[k]).T
             b = self._noise.scatter_share * self._effects(self._middle(s.q, s.w, dt), scattered, dt)
             covariance[:12, :12] += b @ b.T
 
@@ -304,10 +347,14 @@ class MotionFilter:
         f[_V, _Q], f[_V, _W] = turned, dt / 2.0 * turned
         f[_X, _Q] = dt / 2.0 * turned - half @ rotations.skew(moment[:3]) / self._mass_kg
 
-        late = (g @ (columns @ commanded.impulses_by_delay[k]))[:, None]
-        late_moment = (g @ (columns @ commanded.moments_by_delay[k]))[:, None]
+        late = np.asarray(
+            np.tensordot(g, columns @ commanded.impulses_by_latency[k], 1), dtype=float
+        )
+        late_moment = np.asarray(
+            np.tensordot(g, columns @ commanded.moments_by_latency[k], 1), dtype=float
+        )
         f[:, self._gains] = self._effects(half, by_gain.T, dt, moment_by_gain.T)
-        f[:, self._delay] = self._effects(half, late, dt, late_moment)
+        f[:, self._latency] = self._effects(half, late, dt, late_moment)
         f[:, self._push] = self._effects(half, np.diag(self._actuation.axes) * dt, dt)
         self._add_body(f, w, turn, impulse, moment, dt)
         return f

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from chaserdock_agents.gateway.safety import limited_wrench
@@ -50,6 +51,13 @@ class MeasuredMotion:
     free: BoolArray
 
 
+class Latency(NamedTuple):
+    """Time from a command to the motion: a delay, and a first-order lag of this time constant."""
+
+    delay_s: float
+    lag_s: float = 0.0
+
+
 class Pulses:
     """What on/off thrusters were told to give."""
 
@@ -65,10 +73,12 @@ class Pulses:
         """Whether anything was commanded."""
         return bool(self._pulses)
 
-    def over(self, time_ns: IntArray, delays_s: Sequence[float]) -> tuple[Array, Array]:
+    def over(self, time_ns: IntArray, latencies: Sequence[Latency]) -> tuple[Array, Array]:
         """Return impulses and their first moments (see ``Valves``) between successive times (K,),
-        each (delays, K - 1, n), if they come later by each of the delays.
+        each (latencies, K - 1, n), if they come later by each of the delays. The lag of valves is
+        part of their model.
         """
+        delays_s = [latency.delay_s for latency in latencies]
         shape = (len(delays_s), len(time_ns) - 1, len(self._thrusters))
         impulses, moments = np.zeros(shape), np.zeros(shape)
         late_ns = [round(d * 1e9) for d in delays_s]
@@ -88,6 +98,24 @@ class Pulses:
             if k % 32 == 0:
                 valves.forget_before(begin_ns - max(late_ns) - _KEPT_NS)
         return impulses, moments
+
+    lags = False
+    """Whether a lag beside the stated one of the valves is told."""
+
+    def scattered(self, time_ns: IntArray, delay_s: float) -> Array:
+        """Return the impulse (K - 1, n) by whose share each thruster scatters between successive
+        times (K,): of whole pulses, when they end, as the width of a pulse scatters; several add as
+        squares.
+        """
+        ends = np.array([(close_ns, close_ns - open_ns) for open_ns, close_ns, _ in self._pulses])
+        numbers = np.array([k for *_, k in self._pulses])
+        thrusts = np.array([t.thrust_N for t in self._thrusters])[numbers]
+        rows = np.searchsorted(time_ns, ends[:, 0] + round(delay_s * 1e9)) - 1
+        squares = np.zeros(
+            (len(time_ns) + 1, len(self._thrusters))
+        )  # the last row: before or after
+        np.add.at(squares, (rows, numbers), (ends[:, 1] * 1e-9 * thrusts) ** 2)
+        return np.sqrt(squares[: len(time_ns) - 1])
 
 
 class Wrenches:
@@ -120,11 +148,14 @@ class Wrenches:
         """Whether anything was commanded."""
         return bool(np.any(self._wrenches))
 
-    def over(self, time_ns: IntArray, delays_s: Sequence[float]) -> tuple[Array, Array]:
-        """Return impulses and first moments of force and torque, each (delays, K - 1, 6). See
+    def over(self, time_ns: IntArray, latencies: Sequence[Latency]) -> tuple[Array, Array]:
+        """Return impulses and first moments of force and torque, each (latencies, K - 1, 6). See
         ``Pulses.over``.
         """
-        found = [self._at(np.asarray(time_ns * 1e-9 - delay, dtype=float)) for delay in delays_s]
+        found = [
+            self._at(np.asarray(time_ns * 1e-9 - x.delay_s, dtype=float), x.lag_s)
+            for x in latencies
+        ]
         step_s = np.diff(time_ns)[:, None] * 1e-9
         impulses = [np.diff(once, axis=0) for once, _ in found]
         moments = [
@@ -132,13 +163,36 @@ class Wrenches:
         ]
         return np.array(impulses), np.array(moments)
 
-    def _at(self, time_s: Array) -> tuple[Array, Array]:
+    lags = True
+    """See ``Pulses.lags``."""
+
+    def scattered(self, time_ns: IntArray, delay_s: float) -> Array:
+        """Return the impulse (K - 1, 6) by whose share each component scatters between successive
+        times (K,): of whole commands, when the next one acts. See ``Pulses.scattered``.
+        """
+        rows = np.searchsorted(time_ns * 1e-9, self._from_s[1:] + delay_s) - 1
+        squares = np.zeros((len(time_ns) + 1, 6))  # the last row: before or after
+        np.add.at(squares, rows, (np.diff(self._from_s)[:, None] * self._wrenches[:-1]) ** 2)
+        return np.sqrt(squares[: len(time_ns) - 1])
+
+    def _at(self, time_s: Array, lag_s: float) -> tuple[Array, Array]:
+        """Return the integral of the wrench, and that of its integral, up to times (K,), each (K,
+        6).
+        """
         row = np.maximum(np.searchsorted(self._from_s, time_s, side="right") - 1, 0)
         since = np.maximum(time_s - self._from_s[row], 0.0)[:, None]
         once = self._impulse[row] + self._wrenches[row] * since
-        return once, self._twice[row] + (
-            self._impulse[row] + self._wrenches[row] * since / 2.0
-        ) * since
+        twice = self._twice[row] + (self._impulse[row] + self._wrenches[row] * since / 2.0) * since
+        if not lag_s:
+            return once, twice
+        # The lagging wrench y obeys lag y' = wrench - y, so its integral is short by lag y.
+        lagging = np.zeros_like(self._wrenches)  # at the beginning of each command
+        kept = np.exp(-np.diff(self._from_s) / lag_s)
+        for k, share in enumerate(kept.tolist()):
+            lagging[k + 1] = self._wrenches[k] + (lagging[k] - self._wrenches[k]) * share
+        now = self._wrenches[row] + (lagging[row] - self._wrenches[row]) * np.exp(-since / lag_s)
+        missing = lag_s * now
+        return once - missing, twice - lag_s * (once - missing)
 
 
 @dataclass(frozen=True, eq=False)

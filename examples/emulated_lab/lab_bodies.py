@@ -181,6 +181,11 @@ class Actuators:
         self._begun_ns = 0
         self.output = np.zeros(6)
 
+    @property
+    def is_at_zero(self) -> bool:
+        """Whether zero is commanded."""
+        return not (self._wrench.any() or self._duty.any())
+
     def command(self, force: np.ndarray, torque: np.ndarray) -> None:
         """Give a wrench from now on."""
         self._wrench = np.concatenate([force, torque])

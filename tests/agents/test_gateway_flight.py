@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -247,6 +248,12 @@ def test_the_mission_goes_on_while_robots_are_armed(
     ]
     assert np.diff(ticks_s).max() < 0.07
     assert "actuators stopped" not in flight.output
+    (added,) = re.findall(r"added latency: (.*)", flight.output)
+    latest_ms = {
+        kind: float(p99) for kind, p99 in re.findall(r"(\w+) [\d.]+ ms, p99 ([\d.]+)", added)
+    }
+    assert latest_ms.keys() == {"images", "references", "commands"}
+    assert max(latest_ms.values()) <= 2.0  # the interval at which devices are read
 
 
 def test_disarming_wins_over_arming(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import virtual_lab
 from chaserdock_agents.gateway import process as gateway
@@ -71,7 +70,7 @@ def flown(
     assert not flight.crashes
     said = [x for x in flight.output.splitlines() if "disarmed" in x or "kill accepted" in x]
     for actuators in lab.actuators.values():
-        assert not np.any(actuators._wrench)
+        assert actuators.is_at_zero
     return flight, "\n".join(said)
 
 

@@ -7,6 +7,7 @@ Implements ``CommandedActuators``: what the world does with simulated actuators.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -24,17 +25,22 @@ class RobotActuation:
 
     With thrusters, each carrier period's pulses become one duty, which the robot holds for a period
     from when it gets it: a command that comes late is late, and nothing of it is lost. Without, a
-    wrench acts until the next one. ``matrix`` (6, n): wrench of each open thruster.
+    wrench acts until the next one. ``matrix`` (6, n): wrench of each open thruster. ``due_ns``:
+    when the wrench that was taken last had arrived and was to act, by ``arrived_ns()`` while it is
+    given; None for others.
     """
 
-    def __init__(self, body: Body, timing: Timing) -> None:
-        self._timing = timing
+    def __init__(
+        self, body: Body, timing: Timing, arrived_ns: Callable[[], int] = lambda: 0
+    ) -> None:
+        self._timing, self._arrived_ns = timing, arrived_ns
+        self.due_ns: int | None = None
         self._has_thrusters = body.actuation == "thrusters"
         self.matrix: Array = wrench_matrix(body.thrusters) if self._has_thrusters else np.zeros(0)
         self._period_steps = timing.physics_hz // body.modulation.carrier_hz
         # As chasers have it: the first period begins when a command can first take effect.
         self._first_step = timing.latency_steps % self._period_steps
-        self._waiting: list[tuple[int, int, ActuatorCommand]] = []
+        self._waiting: list[tuple[int, int, int, ActuatorCommand]] = []
         self._received = 0
         self._pulses: list[ThrusterPulse] = []
         self._isolated: tuple[int, ...] = ()
@@ -46,7 +52,8 @@ class RobotActuation:
         """Queue a command that acts from ``effective_step`` on; a late one acts at once."""
         self._received += 1
         time_ns = self._timing.time_ns(max(effective_step, now_step))
-        heapq.heappush(self._waiting, (time_ns, self._received, command))
+        due_ns = max(self._timing.time_ns(effective_step), self._arrived_ns())
+        heapq.heappush(self._waiting, (time_ns, self._received, due_ns, command))
 
     def stop(self, step: int) -> None:
         """Discard all commands; the next output is zero."""
@@ -59,9 +66,10 @@ class RobotActuation:
         """Return force (3,), torque (3,) and duty (n,) that act from now on; None if nothing
         changes. Body axes, CRF.
         """
-        newest = None
+        newest = self.due_ns = None
         while self._waiting and self._waiting[0][0] <= now_ns:
-            newest = heapq.heappop(self._waiting)[2]
+            *_, due_ns, newest = heapq.heappop(self._waiting)
+            self.due_ns = None if self._has_thrusters else due_ns
             self._pulses += newest.pulses
             self._isolated = newest.isolated
         if self._is_stopped and newest is None:

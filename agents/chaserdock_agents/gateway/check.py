@@ -81,7 +81,7 @@ def _check(
             laboratory.read_odometry()
             for _ in laboratory.read_references():
                 pass
-            for chaser, image, time_ns in laboratory.read_images():
+            for chaser, image, time_ns, _ in laboratory.read_images():
                 eyes[chaser].look(image, time_ns)
         except DeviceError as error:
             if str(error) not in lost:

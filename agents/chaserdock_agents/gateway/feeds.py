@@ -50,6 +50,11 @@ class DeviceWatch:
         self.count += 1
         self._arrived_ns.append(now_ns)
 
+    @property
+    def newest_ns(self) -> int:
+        """Time of the newest arrival. Raises IndexError before the first one."""
+        return self._arrived_ns[-1]
+
     def age_s(self, now_ns: int) -> float:
         """Return the time since the newest arrival, infinite before the first one."""
         return (now_ns - self._arrived_ns[-1]) / 1e9 if self._arrived_ns else math.inf

@@ -78,11 +78,11 @@ class Laboratory:
         for system in self._references:
             yield from system.poll()
 
-    def read_images(self) -> Iterator[tuple[int, ImageArray, int]]:
-        """Yield chaser, image and exposure by the host's clock. Raises DeviceError."""
+    def read_images(self) -> Iterator[tuple[int, ImageArray, int, int]]:
+        """Yield chaser, image, exposure and arrival by the host's clock. Raises DeviceError."""
         for camera in self.cameras:
             for image, time_ns in camera.poll():
-                yield camera.device.chaser, image, time_ns
+                yield camera.device.chaser, image, time_ns, camera.watch.newest_ns
 
     def sights(self, command_ages_s: dict[int, float]) -> tuple[RobotSight, ...]:
         """Return what is known of each robot now. ``command_ages_s``: by chaser."""

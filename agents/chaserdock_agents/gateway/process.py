@@ -41,6 +41,7 @@ from .devices import DeviceError, DeviceHost, ImageArray
 from .feeds import ImageWatch, PoseFeed
 from .images import image_message
 from .lab import Laboratory
+from .latency import AddedLatency
 from .odometry import FittedState
 from .resume import BegunMission, begun_mission, digest_of, forget_mission, note_mission
 from .safety import RobotSight, SafetyGate
@@ -114,10 +115,11 @@ class Gateway:
             options = dataclasses.replace(options, recorder_expected=False)
         self._used_ns: dict[int, int] = {}
         self._commanded_ns: dict[int, int] = {}
+        self._added = AddedLatency()
         self._missing: set[int] = set()
         self._images = ImageWatch(c.device.chaser for c in laboratory.cameras)
         self._actuation = {
-            f"chaser/{i}": RobotActuation(scenario.chaser, self._timing)
+            f"chaser/{i}": RobotActuation(scenario.chaser, self._timing, self._command_arrived_ns)
             for i in range(self._chasers)
         }
         for i in range(self._chasers):
@@ -148,6 +150,9 @@ class Gateway:
     def _mission_ns(self) -> int:
         return max(0, self._now_ns() - self._start_ns)
 
+    def _command_arrived_ns(self) -> int:
+        return max(0, round(self._barrier.arrived_s * 1e9) - self._start_ns)
+
     def run(self, stop: StopSignal) -> int:
         """Wait for the processes, fly all ticks and end the mission; return the exit status."""
         end_keys = listen_to_keys(self._requests)
@@ -161,6 +166,8 @@ class Gateway:
         finally:
             end_keys()
             self._lab.stop()
+            if added := str(self._added):
+                print_status("gateway", f"added latency: {added}")
 
     def _begin(self) -> None:
         """Let the mission's time begin, or go on from its beginning by another gateway."""
@@ -251,8 +258,9 @@ class Gateway:
     def _read(self) -> None:
         try:
             self._lab.read_odometry()
-            for chaser, image, time_ns in self._lab.read_images():
-                self._publish_image(chaser, image, time_ns)
+            for chaser, image, time_ns, arrived_ns in self._lab.read_images():
+                if self._publish_image(chaser, image, time_ns):
+                    self._added.note("images", arrived_ns, self._now_ns())
             for feed, pose in self._lab.read_references():
                 self._name_jump(feed)
                 self._publish_reference(feed, pose)
@@ -284,15 +292,17 @@ class Gateway:
             omega_rad_s=None if pose.omega_rad_s is None else vector(pose.omega_rad_s),
         )
         self._node.publish(topics.BODY_REFERENCE, message, body)
+        self._added.note("references", feed.watch.newest_ns, self._now_ns())
 
-    def _publish_image(self, chaser: int, image: ImageArray, time_ns: int) -> None:
+    def _publish_image(self, chaser: int, image: ImageArray, time_ns: int) -> bool:
         exposed_ns = time_ns - self._start_ns
         if not self._gate.is_armed or exposed_ns <= 0 or chaser not in self._barrier.chasers:
-            return
+            return False
         quality = self._scenario.camera.effects.jpeg_quality
         message = image_message(self._timing.rate_hz, quality, chaser, image, exposed_ns)
         self._images.note(chaser, self._mission_ns())
         self._node.publish(topics.IMAGE, message, chaser)
+        return True
 
     def _publish_odometry(self, tick: int) -> None:
         time_ns = self._timing.tick_time_ns(tick)
@@ -351,6 +361,8 @@ class Gateway:
                 self._lab.send(chaser, actuation, output)
             except DeviceError as error:
                 self._trip(str(error))
+            if actuation.due_ns is not None:
+                self._added.note("commands", actuation.due_ns, self._mission_ns())
 
     # -- safety ------------------------------------------------------------------------------------
 

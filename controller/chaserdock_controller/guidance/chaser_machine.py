@@ -124,8 +124,9 @@ class ChaserMachine:
     As of the last tick in which they were known: ``position_m`` (3,), its estimated centre in TRF;
     ``seen``, its state at its port; ``relative``, its state relative to the target where passive
     safety is enforced. ``failure``: why no plan of it can be flown. ``interrupted``: it resumes its
-    approach when the target is seen again. ``abort_margin``: sigmas of its best abort. ``changes``:
-    log that all chasers share.
+    approach when the target is seen again. ``abort_margin``: sigmas of its best abort. ``led_s``:
+    time of the last tick in which its state and the target's pose were known. ``changes``: log that
+    all chasers share.
     """
 
     def __init__(self, scenario: FlightScenario, number: int, changes: list[PhaseChange]) -> None:
@@ -140,6 +141,7 @@ class ChaserMachine:
         self.failure: PlanningFailure | None = None
         self.interrupted = False
         self.abort_margin: float | None = None
+        self.led_s: float | None = None
         self._last_command: tuple[float, OperatorCommand] | None = None
         self._activities: dict[Phase, Activity] = {}
         self._answering: dict[str, Activity] = {}

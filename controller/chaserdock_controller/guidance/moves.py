@@ -10,6 +10,7 @@ from chaserdock_protocol.scenario import FlightScenario
 from .chaser_machine import ChaserMachine
 from .escape import EscapePlanner
 from .parameters import GUIDANCE
+from .phases import Phase
 from .trajectories import Motion, move_to
 
 
@@ -26,6 +27,16 @@ class MovePlanner:
         self.escapes: EscapePlanner | None = None
         if scenario.limits.passive_safety == "enforce":
             self.escapes = EscapePlanner(scenario, self.abort_m_s)
+
+    def speed_m_s(self, phase: Phase) -> float:
+        """Return the speed of the moves in a phase."""
+        match phase:
+            case Phase.ABORT:
+                return self.abort_m_s
+            case Phase.APPROACH | Phase.DOCKED | Phase.RETREAT:
+                return self.approach_m_s
+            case _:
+                return self.goto_m_s
 
     def move(self, chaser: ChaserMachine, goal_m: Array, now_s: float, speed_m_s: float) -> Motion:
         """Return the move to a goal (3,), TRF, at most at ``speed_m_s``; slower where passive

@@ -152,6 +152,11 @@ class SearchProgress(Struct, frozen=True):
     pause_s: float = 0.0
     resumed_s: float = -math.inf
 
+    def taken_up(self, now_s: float) -> SearchProgress:
+        """Return the progress at ``now_s`` if the search has rested since the last update."""
+        paused_s = self.paused_s + now_s - self.updated_s
+        return replace(self, updated_s=now_s, paused_s=paused_s)
+
     def at(self, now_s: float, acquiring: bool | None) -> SearchProgress:
         """Return the progress at ``now_s``. ``acquiring``: the chaser searches an earlier image for
         the target.

@@ -34,6 +34,7 @@ from .docking import DockingObservation
 from .escape import RelativeState
 from .fleet import ChaserFleet
 from .horizon import ReferenceBuilder
+from .pauses import resume_after_pause
 from .phases import Phase
 
 
@@ -64,11 +65,14 @@ class GuidanceStage:
         """
         now_s, fleet, target = observation.time_s, self.fleet, estimation.target
         known = self._known(observation, estimation, history)
+        ticks = tuple(zip(fleet.chasers, known, strict=True))
+        for chaser, tick in ticks:
+            if estimation.known and tick.own is not None:
+                resume_after_pause(chaser, tick, fleet.moves)
         if estimation.known:
             fleet.follow_target(now_s, known, target.status == "tracking", is_settled(target))
         else:
             fleet.miss_target(now_s, target.status == "lost")
-        ticks = tuple(zip(fleet.chasers, known, strict=True))
         for chaser, tick in ticks:
             chaser.follow_planning(tick)
 

@@ -121,6 +121,7 @@ class MachineState(Struct, forbid_unknown_fields=True):
     failure: PlanningFailure | None
     interrupted: bool
     abort_margin: float | None
+    led_s: float | None
     _last_command: tuple[float, OperatorCommand] | None
 
 

@@ -76,7 +76,7 @@ class TickBarrier:
         self._open = OpenTick()
         self._repeats = 0
         self._no_chaser_since_s: float | None = None
-        self._polled_s = node.host.now_s()
+        self.arrived_s = self._polled_s = node.host.now_s()
         heartbeat.hangs = lambda: node.host.now_s() - self._polled_s > LONGEST_STEP_S
 
     @property
@@ -247,6 +247,7 @@ class TickBarrier:
         """Process one message, if one arrives in time, and the departure of processes."""
         self._polled_s = self._node.host.now_s()
         received = self._node.receive(timeout_s)
+        self.arrived_s = self.arrived_s if received is None else received.arrived_s
         match received.message if received is not None else None:
             case ActuatorCommand() as command:
                 self._apply_command(command)

@@ -22,9 +22,6 @@ class RetreatActivity(Activity):
     def __init__(self, fleet: ChaserFleet) -> None:
         self._fleet, self._moves = fleet, fleet.moves
 
-    def _speed_m_s(self, phase: Phase) -> float:
-        return self._moves.abort_m_s if phase is Phase.ABORT else self._moves.approach_m_s
-
     def enter(self, chaser: ChaserMachine, begun: ChaserGuidance, cause: Cause) -> ChaserGuidance:
         """Begin the move to the nominal offset; from inside a corridor first along its axis to the
         entry.
@@ -37,7 +34,10 @@ class RetreatActivity(Activity):
             elif cause.trigger is Trigger.ATTEMPT_FAILED and _may_try_again(chaser):
                 then = NextMove.ATTEMPT
             return replace(begun, move=self._way_out(chaser, begun.phase, now_s), then=then)
-        move, speed = self._escape(chaser, now_s) if aborts else None, self._speed_m_s(begun.phase)
+        move, speed = (
+            self._escape(chaser, now_s) if aborts else None,
+            self._moves.speed_m_s(begun.phase),
+        )
         if move is None:
             move = self._moves.move(chaser, chaser.nominal_m, now_s, speed)
         return replace(begun, move=move)
@@ -67,7 +67,7 @@ class RetreatActivity(Activity):
             case NextMove.ATTEMPT if chaser.failure is None:
                 chaser.fire(Trigger.NEXT_ATTEMPT, now_s)
             case NextMove.ATTEMPT | NextMove.NOMINAL:
-                here, speed = chaser.motion(now_s), self._speed_m_s(state.phase)
+                here, speed = chaser.motion(now_s), self._moves.speed_m_s(state.phase)
                 move = move_to(here, chaser.nominal_m, now_s, speed)
                 chaser.state = replace(state, move=move, then=NextMove.NONE)
             case NextMove.ESCAPE if (escape := self._escape(chaser, now_s)) is not None:
@@ -80,7 +80,7 @@ class RetreatActivity(Activity):
         assert chaser.dock is not None
         assert chaser.seen is not None
         here, entry = stay(chaser.seen.offset_m, now_s), chaser.dock.entry()
-        return move_to(here, entry, now_s, self._speed_m_s(phase))
+        return move_to(here, entry, now_s, self._moves.speed_m_s(phase))
 
     def _escape(self, chaser: ChaserMachine, now_s: float) -> Escape | None:
         """Return the abort onto a safe coast, and log its margin; None unless passive safety is

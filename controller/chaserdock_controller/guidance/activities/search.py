@@ -24,11 +24,13 @@ class SearchActivity(Activity):
 
     def __init__(self, scenario: FlightScenario) -> None:
         self._body, self._camera = scenario.chaser, scenario.camera_model()
+        self._lifetime_s = scenario.controller.command_lifetime_s
 
     def command(self, chaser: ChaserMachine, known: ChaserTick) -> DirectCommand | None:
         """Turn along the search pattern, or towards the target once its pose is known.
 
-        The pattern pauses while the target is being acquired in an earlier image.
+        The pattern pauses while the target is being acquired in an earlier image, and goes on where
+        it was after a time without these commands.
         """
         own, target, state = known.own, known.target, chaser.state
         assert own is not None
@@ -37,6 +39,8 @@ class SearchActivity(Activity):
             return DirectCommand("search", turning_wrench(own, self._body, q, q))
         now_s = own.sim_time_ns / 1e9
         before = state.search or SearchProgress(np.array(own.q_wxyz), now_s)
+        if now_s - before.updated_s > self._lifetime_s:  # it did something else, or nothing
+            before = before.taken_up(now_s)
         progress = before.at(now_s, known.acquiring)
         chaser.state = replace(state, search=progress)
         time_s = now_s - state.since_s - progress.paused_s

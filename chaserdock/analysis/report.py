@@ -17,6 +17,7 @@ from typing import Any
 
 from chaserdock_protocol.output_files import write_atomically
 
+from chaserdock.criterion import html_of_all, quantity
 from chaserdock.html_page import PAGE_FILES, html_page, table
 from chaserdock.verdict import verdict_of
 
@@ -100,17 +101,6 @@ def report_of(log: Path) -> str:
     return html_page(f"{flight.scenario.name} {_DASH} chaserdock", body, script)
 
 
-def _quantity(value: float | None, unit: str, factor: float = 1.0, digits: int = 3) -> str:
-    if value is None:
-        return _DASH
-    scaled = value * factor
-    # "#" keeps trailing zeros; a trailing decimal point is removed. Large numbers without exponent.
-    text = (
-        f"{scaled:.0f}" if 10**digits <= abs(scaled) < 1e9 else f"{scaled:#.{digits}g}".rstrip(".")
-    )
-    return f"{text} {unit}".rstrip()
-
-
 def _number(value: int | None) -> str:
     return _DASH if value is None else str(value)
 
@@ -120,7 +110,7 @@ def _count(number: int, thing: str) -> str:
 
 
 def _rms(mean_square: float | None, unit: str, factor: float) -> str:
-    return _quantity(None if mean_square is None else math.sqrt(mean_square), unit, factor)
+    return quantity(None if mean_square is None else math.sqrt(mean_square), unit, factor)
 
 
 def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
@@ -147,7 +137,7 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
 
 
 def _outcome(result: dict[str, Any]) -> str:
-    return verdict_of(result).html()
+    return verdict_of(result).html(table=True)
 
 
 def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
@@ -164,15 +154,15 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
             f"chaser {i}",
             _rms(c["steady"]["position_mse_m2"], "mm", 1e3),
             _rms(c["steady"]["orientation_mse_rad2"], "°", degree),
-            _quantity(c["position_mse_m2"], "m²"),
-            _quantity(c["orientation_mse_rad2"], "rad²"),
+            _rms(c["position_mse_m2"], "mm", 1e3),
+            _rms(c["orientation_mse_rad2"], "°", degree),
             *([_estimated(c)] if estimated else []),
             *([_relative(c)] if relative else []),
             *([_innovations(c)] if innovations else []),
             *([_docked(c)] if at_distance else []),
-            _quantity(c["min_distance_target_m"], "m"),
-            _quantity(c["impulse_N_s"], "N s"),
-            *([_quantity(c["propellant_kg"], "g", 1e3)] if fuel else []),
+            quantity(c["min_distance_target_m"], "m"),
+            quantity(c["impulse_N_s"], "N s"),
+            *([quantity(c["propellant_kg"], "g", 1e3)] if fuel else []),
         )
         for i, c in result["chasers"].items()
     ]
@@ -181,22 +171,28 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         "",
         "steady position RMS",
         "steady orientation RMS",
-        "position MSE, whole run",
-        "orientation MSE, whole run",
+        "position RMS, whole flight",
+        "orientation RMS, whole flight",
         *(["steady RMS as estimated in flight; sightings rejected"] if estimated else []),
         *(["estimated pose relative to the target, RMS"] if relative else []),
         *(["NIS per degree of freedom; above the 95 % band"] if innovations else []),
-        *(["docked since"] if at_distance else []),
+        *(["docking pose since"] if at_distance else []),
         "minimum distance to target",
         "impulse",
         *(["propellant"] if fuel else []),
     )
     until = s.steady_until_s or s.duration_s
+    docked = (
+        " Docking pose since: within the tolerances of [approach] from then to the end. The phase "
+        f"docked begins {s.approach.docked_time_s:g} s later: the controller waits that long."
+        if at_distance and s.success.docked
+        else ""
+    )
     return (
         "<h2>Chasers</h2>"
         + table(head, rows)
         + '<p class="faint">Errors relative to the reference pose on the true target. '
-        + f"Steady state: {s.settling_s:g} s to {until:g} s.</p>"
+        + f"Steady state: {s.settling_s:g} s to {until:g} s.{docked}</p>"
         + _captures(result)
         + _rendezvous(result)
     )
@@ -208,7 +204,7 @@ def _relative(c: dict[str, Any]) -> str:
     if e is None:
         return _DASH
     position, angle = e["position_rms_m"], e["orientation_rms_rad"]
-    return f"{_quantity(position, 'mm', 1e3)}, {_quantity(angle, '°', math.degrees(1.0))}"
+    return f"{quantity(position, 'mm', 1e3)}, {quantity(angle, '°', math.degrees(1.0))}"
 
 
 def _innovations(c: dict[str, Any]) -> str:
@@ -216,16 +212,14 @@ def _innovations(c: dict[str, Any]) -> str:
     found = c.get("innovations")
     if found is None:
         return _DASH
-    return (
-        f"{_quantity(found['mean_per_freedom'], '')}; {_quantity(found['above_share'], '%', 1e2)}"
-    )
+    return f"{quantity(found['mean_per_freedom'], '')}; {quantity(found['above_share'], '%', 1e2)}"
 
 
 def _estimated(c: dict[str, Any]) -> str:
     """Return the tracking errors by the flight's own estimates, and its rejected sightings."""
     e, use = c["estimated_tracking"], c["sightings"]
-    position = _quantity(e["position_rms_m"], "mm", 1e3)
-    angle = _quantity(e["orientation_rms_rad"], "°", math.degrees(1.0))
+    position = quantity(e["position_rms_m"], "mm", 1e3)
+    angle = quantity(e["orientation_rms_rad"], "°", math.degrees(1.0))
     return f"{position}, {angle}; {use['rejected']} of {use['used'] + use['rejected']}"
 
 
@@ -244,11 +238,11 @@ def _captures(result: dict[str, Any]) -> str:
         (
             f"chaser {i}",
             capture_state(k),
-            _quantity(k["latch_time_s"], "s", digits=4),
-            _quantity(k["contact_lateral_m"], "mm", 1e3),
-            _quantity(k["contact_angle_rad"], "°", degree),
-            _quantity(k["contact_closing_m_s"], "mm/s", 1e3),
-            _quantity(k["contact_lateral_speed_m_s"], "mm/s", 1e3),
+            quantity(k["latch_time_s"], "s", digits=4),
+            quantity(k["contact_lateral_m"], "mm", 1e3),
+            quantity(k["contact_angle_rad"], "°", degree),
+            quantity(k["contact_closing_m_s"], "mm/s", 1e3),
+            quantity(k["contact_lateral_speed_m_s"], "mm/s", 1e3),
             str(k["probe_touches"]),
         )
         for i, c in result["chasers"].items()
@@ -279,12 +273,12 @@ def _rendezvous(result: dict[str, Any]) -> str:
     rows = [
         (
             f"chaser {i}",
-            _quantity(k["speed_margin_m_s"], "mm/s", 1e3),
-            _quantity(k["cone_angle_rad"], "°", math.degrees(1.0)),
-            _quantity(k["arrived_s"], "s", digits=5),
-            _quantity(k["arrived_speed_m_s"], "mm/s", 1e3),
-            _quantity(k["abort_s"], "s", digits=5),
-            _quantity(k["abort_clear_m"], "m"),
+            quantity(k["speed_margin_m_s"], "mm/s", 1e3),
+            quantity(k["cone_angle_rad"], "°", math.degrees(1.0)),
+            quantity(k["arrived_s"], "s", digits=5),
+            quantity(k["arrived_speed_m_s"], "mm/s", 1e3),
+            quantity(k["abort_s"], "s", digits=5),
+            quantity(k["abort_clear_m"], "m"),
         )
         for i, c in result["chasers"].items()
         if (k := c.get("rendezvous")) is not None
@@ -306,28 +300,28 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     estimate = [
         (
             "position",
-            _quantity(e["position_rms_m"], "mm", 1e3),
-            _quantity(e["max_position_error_m"], "mm", 1e3),
+            quantity(e["position_rms_m"], "mm", 1e3),
+            quantity(e["max_position_error_m"], "mm", 1e3),
         ),
         (
             "orientation",
-            _quantity(e["orientation_rms_rad"], "°", degree),
-            _quantity(e["max_orientation_error_rad"], "°", degree),
+            quantity(e["orientation_rms_rad"], "°", degree),
+            quantity(e["max_orientation_error_rad"], "°", degree),
         ),
-        ("velocity", _quantity(e["velocity_rms_m_s"], "mm/s", 1e3), ""),
-        ("rate", _quantity(e["omega_rms_rad_s"], "°/s", degree), ""),
+        ("velocity", quantity(e["velocity_rms_m_s"], "mm/s", 1e3), ""),
+        ("rate", quantity(e["omega_rms_rad_s"], "°/s", degree), ""),
     ]
     latency, solver = result["latency_s"], result["solver"]
     against = flight.motion.describe() if TARGET in flight.motion else "nothing: no figures"
     safety = [
-        ("minimum distance between chasers", _quantity(result["min_distance_chasers_m"], "m")),
+        ("minimum distance between chasers", quantity(result["min_distance_chasers_m"], "m")),
         ("collisions", _number(result["collisions"])),
-        ("mean NEES of the estimate (6 expected)", _quantity(e["nees_mean"], "")),
-        (f"solve time ({solver['name']}), median", _quantity(solver["solve_s"]["p50"], "ms", 1e3)),
-        ("solve time, 95th percentile", _quantity(solver["solve_s"]["p95"], "ms", 1e3)),
+        ("mean NEES of the estimate (6 expected)", quantity(e["nees_mean"], "")),
+        (f"solve time ({solver['name']}), median", quantity(solver["solve_s"]["p50"], "ms", 1e3)),
+        ("solve time, 95th percentile", quantity(solver["solve_s"]["p95"], "ms", 1e3)),
         ("failed solves", str(solver["failures"])),
-        ("exposure to command, median", _quantity(latency["p50"], "ms", 1e3)),
-        ("exposure to command, 99th percentile", _quantity(latency["p99"], "ms", 1e3)),
+        ("exposure to command, median", quantity(latency["p50"], "ms", 1e3)),
+        ("exposure to command, 99th percentile", quantity(latency["p99"], "ms", 1e3)),
         ("late commands", _number(result["late_commands"])),
         ("messages lost", str(sum(m["lost"] for m in result["messages"].values()))),
     ]
@@ -480,6 +474,8 @@ def _details(flight: RecordedFlight, result: dict[str, Any]) -> str:
     run.append(("digest", result["digest"]))
     return (
         '<h2 id="scenario">Scenario and data</h2>'
+        "<details><summary>Criteria of every chaser</summary>"
+        f"{html_of_all(verdict_of(result).criteria)}</details>"
         f"<details><summary>Scenario as flown</summary><pre>{escape(scenario)}</pre></details>"
         f"<details><summary>Messages</summary>{table(('topic', 'in the log', 'lost'), messages)}"
         + (f"<h3>Rejected on receipt</h3>{table(('reason', 'count'), refused)}" if refused else "")

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Vector3
 from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.mission import Success
@@ -22,6 +21,7 @@ from chaserdock.criterion import Criterion, criterion
 from .flight import LoadHistory, RecordedFlight, SensedDocking
 from .motion import TARGET
 from .rendezvous import rendezvous_criteria
+from .stack import stack_motion
 
 _CONTACT_SLACK_M = 0.02
 """Distance (m) by which a chaser in contact may be closer than a latched one, because it tilts and
@@ -177,39 +177,18 @@ def stack_rest(flight: RecordedFlight) -> dict[str, float | None] | None:
     ``since_s``: simulated time since which both were within ``success.detumbled``; None if they are
     not at the end.
     """
-    names = ["target", *(f"chaser/{i}" for i in flight.latched)]
     limits = flight.scenario.success.detumbled
-    if limits is None or any(name not in flight.motion for name in names):
+    stack = None if limits is None else stack_motion(flight, dict.fromkeys(flight.latched))
+    if limits is None or stack is None:
         return None
-    if not flight.motion.has_rates():
-        return None
-    tracks = {name: flight.motion[name] for name in names}
-    n = min(len(track.time_s) for track in tracks.values())
-    momentum, mass = np.zeros((n, 3)), 0.0
-    for name, track in tracks.items():
-        mass_kg, centre_m = _mass_and_centre(flight, name)
-        turning = np.cross(track.omega_rad_s[:n], centre_m)
-        momentum += mass_kg * (track.velocity_m_s[:n] + rotations.rotate(track.q_wxyz[:n], turning))
-        mass += mass_kg
-    speed = np.linalg.norm(momentum, axis=1) / mass
-    rate = np.linalg.norm(tracks["target"].omega_rad_s[:n], axis=1)
+    speed, rate, n = stack.speed_m_s, stack.rate_rad_s, len(stack.time_s)
     outside = np.flatnonzero((speed > limits.speed_m_s) | (rate > np.radians(limits.rate_deg_s)))
     first = int(outside[-1]) + 1 if len(outside) else 0
     return {
         "speed_m_s": float(speed[-1]),
         "rate_rad_s": float(rate[-1]),
-        "since_s": float(tracks["target"].time_s[first]) if first < n else None,
+        "since_s": float(stack.time_s[first]) if first < n else None,
     }
-
-
-def _mass_and_centre(flight: RecordedFlight, name: str) -> tuple[float, Vector3]:
-    """Return mass, kg, and centre of mass, m, of a body: the true ones, or else those stated."""
-    for drawn in flight.drawn:
-        if drawn.body == name:
-            return drawn.mass_kg, drawn.centre_of_mass_m
-    if name == TARGET:
-        return flight.scenario.target.mass_kg, flight.scenario.target.centre_of_mass_m
-    return flight.scenario.chaser.mass_kg, (0.0, 0.0, 0.0)
 
 
 def _rest(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:

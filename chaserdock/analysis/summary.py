@@ -494,12 +494,13 @@ def _messages(flight: RecordedFlight) -> dict[str, dict[str, int]]:
 
 def text_of(result: dict[str, Any]) -> str:
     """Format the summary as lines of text, at most ``COLUMNS`` wide: verdict, criteria, chasers."""
-    factor = result["sim_time_s"] / result["wall_time_s"] if result["wall_time_s"] else 0.0
-    verdict = verdict_of(result)
+    verdict, wall_s = verdict_of(result), result["wall_time_s"]
+    speed = (
+        f" in {wall_s:.1f} s ({result['sim_time_s'] / wall_s:.2f} x real time)" if wall_s else ""
+    )
     lines = [
         f"{result['scenario']}: {verdict.headline}; "
-        f"{result['sim_time_s']:.1f} s flown in "
-        f"{result['wall_time_s']:.1f} s ({factor:.2f} x real time), digest {result['digest'][:16]}"
+        f"{result['sim_time_s']:.1f} s flown{speed}, digest {result['digest'][:16]}"
     ]
     lines += [f"  {line}" for line in verdict.lines_beside_table()]
     if result["judged_against"] != "ground truth":

@@ -26,6 +26,7 @@ from chaserdock.analysis.criteria import (
     stack_rest,
 )
 from chaserdock.analysis.rendezvous import rendezvous_criteria, rendezvous_of
+from chaserdock.analysis.stack import stack_motion
 from chaserdock.criterion import (
     COLUMNS,
     Criterion,
@@ -129,18 +130,24 @@ def stack_flight(
     # The common centre is a quarter of the way to the chaser.
     origin = np.outer(speed_m_s, [1.0, 0.0, 0.0]) - np.cross(turning, apart_m / 4.0)
 
-    def moving(velocity: np.ndarray) -> Any:
-        return track(times, velocity_m_s=velocity, omega_rad_s=turning)
+    def moving(velocity: np.ndarray, place_m: np.ndarray | None = None) -> Any:
+        place_m = np.tile(np.zeros(3) if place_m is None else place_m, (n, 1))
+        return track(times, position_m=place_m, velocity_m_s=velocity, omega_rad_s=turning)
 
     def drawn(name: str, mass_kg: float) -> Any:
-        return SimpleNamespace(body=name, mass_kg=mass_kg, centre_of_mass_m=(0.0, 0.0, 0.0))
+        return SimpleNamespace(
+            body=name,
+            mass_kg=mass_kg,
+            centre_of_mass_m=(0.0, 0.0, 0.0),
+            inertia_kg_m2=(20.0, 0.0, 0.0, 0.0, 20.0, 0.0, 0.0, 0.0, 20.0),
+        )
 
     return SimpleNamespace(
         scenario=load_scenario(DETUMBLE),
         motion=true_motion(
             {
                 "target": moving(origin),
-                "chaser/0": moving(origin + np.cross(turning, apart_m)),
+                "chaser/0": moving(origin + np.cross(turning, apart_m), apart_m),
                 "chaser/1": moving(np.ones((n, 3))),
             }
         ),
@@ -205,6 +212,21 @@ def test_a_released_chaser_is_no_part_of_the_stack() -> None:
     both = stack_rest(stack_flight(np.zeros(20), turning))
     assert both is not None
     assert both["speed_m_s"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_momentum_of_a_stack_contains_spin_and_orbit_of_its_bodies_while_they_belong_to_it() -> (
+    None
+):
+    """Target and chaser of 20 kg m^2 each, 150 kg and 50 kg 1 m apart: 77.5 kg m^2 in all."""
+    flight = stack_flight(np.full(10, 0.3), np.full(10, 0.02))
+    both = stack_motion(flight, {0: None})
+    assert both is not None
+    np.testing.assert_allclose(both.angular_momentum_N_m_s, 77.5 * 0.02)
+    np.testing.assert_allclose(both.speed_m_s, 0.3)
+    late = stack_motion(flight, {0: np.arange(10) >= 5})
+    assert late is not None
+    np.testing.assert_allclose(late.angular_momentum_N_m_s[[4, 5]], [20.0 * 0.02, 77.5 * 0.02])
+    assert stack_motion(flight, {7: None}) is None
 
 
 def test_rest_without_truth_or_criterion_is_not_judged() -> None:

@@ -160,6 +160,7 @@
     });
 
     clock.textContent = time.toFixed(1) + " s";
+    document.dispatchEvent(new CustomEvent("replay-time", { detail: time }));
     slider.value = String(time);
     data.chasers.forEach((c, k) => {
       const [a] = place(time);
@@ -201,6 +202,7 @@
   for (const jump of document.querySelectorAll("button[data-time]")) {
     jump.addEventListener("click", () => { time = Math.min(end, Number(jump.dataset.time)); play(false); draw(); canvas.scrollIntoView({ block: "center" }); });
   }
+  document.addEventListener("replay-seek", (e) => { time = Math.min(end, Math.max(0, e.detail)); play(false); draw(); });
   let held = null;
   canvas.addEventListener("pointerdown", (e) => { held = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
   canvas.addEventListener("pointerup", () => { held = null; });

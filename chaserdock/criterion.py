@@ -187,17 +187,20 @@ def html_of_all(criteria: Iterable[Criterion]) -> str:
     return _html([TableRow(c, () if c.chaser is None else (c.chaser,)) for c in criteria])
 
 
-def _html(rows: Iterable[TableRow]) -> str:
-    head = ("criterion", "chaser", "measured", "limit", "margin", "outcome", "")
+def _html(rows: Sequence[TableRow]) -> str:
+    noted = any(row.criterion.note for row in rows)
+    # The outcome comes first: a phone shows the left part of a wide table.
+    head = ("criterion", "outcome", "measured", "limit", "margin", "chaser", *[""] * noted)
     top = "".join(f'<th scope="col">{cell}</th>' for cell in head)
     lines = []
     for row in rows:
         c = row.criterion
-        numbers = "".join(f"<td>{escape(cell)}</td>" for cell in (row.who, *c.cells))
+        numbers = "".join(f"<td>{escape(cell)}</td>" for cell in (*c.cells, row.who))
         lines.append(
-            f'<tr><th scope="row">{escape(c.name)}</th>{numbers}'
-            f'<td class="{LEVELS[c.outcome]}">{c.outcome}</td>'
-            f'<td class="text">{escape(c.note)}</td></tr>'
+            f'<tr><th scope="row">{escape(c.name)}</th>'
+            f'<td class="{LEVELS[c.outcome]}">{c.outcome}</td>{numbers}'
+            + (f'<td class="text">{escape(c.note)}</td>' if noted else "")
+            + "</tr>"
         )
     content = f"<thead><tr>{top}</tr></thead><tbody>{''.join(lines)}</tbody>"
     return f'<div class="wide"><table class="criteria">{content}</table></div>'
@@ -214,5 +217,6 @@ def markdown_table(criteria: Sequence[Criterion]) -> str:
         name = f"{c.name}, chaser {row.who}" if row.who else c.name
         if c.outcome == "not judged":
             name += f": not judged: {c.note}"
-        lines.append(f"| {marks[c.outcome]} | {name} | " + " | ".join(c.cells) + " |")
+        numbers = (cell.replace(" ", "\N{NO-BREAK SPACE}") for cell in c.cells)
+        lines.append(f"| {marks[c.outcome]} | {name} | " + " | ".join(numbers) + " |")
     return "\n".join(lines)

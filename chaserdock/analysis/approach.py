@@ -86,5 +86,6 @@ def approach_of(flight: RecordedFlight, chaser: int) -> DockingApproach | None:
     shown = inside & (range_m <= furthest)
     if np.count_nonzero(shown) < 3:
         return None
-    rows = (values[shown] for values in (times, range_m, lateral_m, closing_m_s))
-    return DockingApproach(*rows, lateral, closing)
+    return DockingApproach(
+        times[shown], range_m[shown], lateral_m[shown], closing_m_s[shown], lateral, closing
+    )

@@ -107,9 +107,9 @@ def _loads(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
     for i, c in result["chasers"].items() if result["collisions"] is not None else ():
         for quantity, limit, unit in _load_limits(s, int(i)):
             load, what = c["capture"]["port_load"], quantity.split("_")[1]
-            beyond = load is not None and load[quantity] > limit
-            note = f"exceeded from {load['limit_exceeded_s']:.2f} s on" if beyond else ""
-            value = None if load is None else load[quantity]
+            value, note = None if load is None else load[quantity], ""
+            if load is not None and value > limit:
+                note = f"exceeded from {load['limit_exceeded_s']:.2f} s on"
             yield criterion(
                 "loads on the ports", f"{what} on the port", value, limit, unit, int(i), note=note
             )
@@ -129,23 +129,22 @@ def nearest_allowed_m(s: Scenario, chaser: int) -> float:
 def _captures(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
     """Yield ``success.latched`` for each of its chasers."""
     for i in s.success.latched:
-        capture = result["chasers"].get(str(i), {}).get("capture")
-        at_s = None if capture is None else capture["latch_time_s"]
-        latched = capture is not None and capture["latched"]
+        capture = result["chasers"].get(str(i), {}).get("capture") or {}
+        latched, verified = capture.get("latched", False), capture.get("verified", False)
         note = ""
-        if capture is not None and not latched and capture["refused"]:
+        if not latched and capture.get("refused"):
             note = f"last rejected touch: {capture['refused'][-1]}"
-        elif latched and not capture["verified"]:
+        elif latched and not verified:
             note = "latched, but not verified by a pull test"
         yield criterion(
             "latched",
             "latched and verified",
-            at_s if latched else None,
+            capture["latch_time_s"] if latched else None,
             result["sim_time_s"],
             "s",
             i,
             note=note,
-            met=latched and capture["verified"],
+            met=latched and verified,
         )
 
 

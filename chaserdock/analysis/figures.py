@@ -320,8 +320,12 @@ def stack(flight: RecordedFlight, _: Traces) -> Figure:
         ),
     ):
         axes.plot(motion.time_s[d], values[d], color=INK)
-        axes.set(ylabel=label, ylim=(0.0, None))
-        if limit is not None:
+        axes.set_ylabel(label)
+        if limit is None:
+            axes.set_ylim(0.0, None)
+        else:  # a limit is a hundredth of what was stopped, and less
+            axes.set_yscale("log")
+            _plain_numbers(axes.yaxis)
             unit = label.partition(" / ")[2]
             limit_line(axes, limit, f"stopped: {limit:g} {unit}; at the end {values[-1]:.2g}")
     panels[0].set_xlim(_span_s(motion.time_s))
@@ -349,14 +353,16 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
         )
     ):
         whole, late = panels[2 * row : 2 * row + 2]
-        reach = 0.0
+        reach, least = 0.0, np.inf
         for i, (time_s, *both) in errors.items():
             d = decimated(len(time_s))
             values = both[row] * factor
             for axes, shown in ((whole, np.maximum(values[d], 1e-4)), (late, values[d])):
                 axes.plot(time_s[d], shown, color=colour(i), label=f"chaser {i}")
             reach = max(reach, _span_of(values, time_s, s.settling_s))
-        whole.set(yscale="log", ylabel=label)
+            least = min(least, float(np.median(values)))
+        # A start on the reference, and passages through it, do not set the scale.
+        whole.set(yscale="log", ylabel=label, ylim=(max(0.05 * least, 1e-4), None))
         late.set_ylabel(label)
         _plain_numbers(whole.yaxis)
         late.set_ylim(0.0, 1.15 * reach)

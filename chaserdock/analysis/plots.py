@@ -176,6 +176,11 @@ def font_face(text: str) -> str:
     return f"@font-face{{font-family:'DejaVu Sans';src:url({url})}}"
 
 
+def _rounded(attribute: re.Match[str]) -> str:
+    """Return an attribute of SVG with coordinates to 0.01 points: two thirds of the length."""
+    return re.sub(r"(\d\.\d\d)\d+", r"\1", attribute[0])
+
+
 def css_colour(hexadecimal: str) -> str:
     """Return the page's CSS variable of a colour of the figures, or the colour itself."""
     variable = _VARIABLES.get(hexadecimal)
@@ -198,7 +203,7 @@ def to_inline_svg(figure: Figure, name: str, title: str) -> str:
     # All figures of a page share one namespace of ids. SVG needs no xlink prefix.
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = text.replace("url(#", f"url(#{name}-").replace('xlink:href="#', f'href="#{name}-')
-    text = re.sub(r"(\d\.\d\d)\d+", r"\1", text)  # 0.01 points: two thirds of the size
+    text = re.sub(r'\s(d|x|y|transform)="[^"]*"', _rounded, text)
     for hexadecimal, variable in _VARIABLES.items():
         text = text.replace(hexadecimal, f"var(--{variable})")
     text = re.sub(

@@ -130,8 +130,10 @@ def _count(number: int, thing: str) -> str:
 
 def _rms(errors: dict[str, Any]) -> str:
     """Return the RMS of position and orientation errors."""
-    squares = (errors["position_mse_m2"], errors["orientation_mse_rad2"])
-    position, angle = (None if square is None else math.sqrt(square) for square in squares)
+    square_m2, square_rad2 = errors["position_mse_m2"], errors["orientation_mse_rad2"]
+    if square_m2 is None or square_rad2 is None:
+        return _DASH
+    position, angle = math.sqrt(square_m2), math.sqrt(square_rad2)
     return f"{quantity(position, 'mm', 1e3)}, {quantity(angle, '°', math.degrees(1.0))}"
 
 

@@ -16,7 +16,7 @@ from .motion import TARGET
 
 
 @dataclass(frozen=True)
-class StackMotion:
+class RecordedStack:
     """Motion of a stack at times (K,) s: angular rate (K,) of the target, speed (K,) of the common
     centre of mass (WRF), and magnitude (K,) of the angular momentum about that centre.
     """
@@ -29,7 +29,7 @@ class StackMotion:
 
 def stack_motion(
     flight: RecordedFlight, members: Mapping[int, NDArray[np.bool_] | None]
-) -> StackMotion | None:
+) -> RecordedStack | None:
     """Return the motion of the target with ``members``: chasers, and when (K,) each belongs to the
     stack; None: always. None if the motion of one of them, or its rates, is not known.
     """
@@ -53,7 +53,7 @@ def stack_motion(
     moving = sum(m * velocity for m, _, velocity, _ in parts) / mass
     momentum = sum(spin + m * np.cross(r - centre, v - moving) for m, r, v, spin in parts)
     target = tracks[TARGET]
-    return StackMotion(
+    return RecordedStack(
         target.time_s[:n],
         np.linalg.norm(target.omega_rad_s[:n], axis=1),
         np.linalg.norm(moving, axis=1),

@@ -167,7 +167,7 @@ def test_limit_below_the_tumble_is_one_line(limits: dict[str, float], message: s
 
 def test_figure_draws_each_port_and_needs_a_load(tmp_path: Path) -> None:
     figure = loads(load_flight(made_log(tmp_path / "a.mcap", FORCES_N)), Traces({}, {}, {}))
-    top, bottom = figure.axes
+    _, top, bottom = figure.axes  # phases, and panels
     force, shear = top.get_lines()[:2]
     assert np.asarray(force.get_ydata()).tolist() == list(FORCES_N)
     assert np.asarray(shear.get_ydata()).tolist() == pytest.approx([0.8 * f for f in FORCES_N])

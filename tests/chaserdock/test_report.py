@@ -320,7 +320,7 @@ def test_pdf_and_svg_contain_truetype(tmp_path: Path) -> None:
     embedded = re.search(r"@font-face\{[^}]*base64,([^)]*)\)", svg)
     assert embedded is not None
     font = TTFont(io.BytesIO(base64.b64decode(embedded[1])))
-    assert {ord(letter) for letter in "offset ≤ 8 mm"} <= set(font.getBestCmap())
+    assert {ord(letter) for letter in "offset ≤ 8 mm"} <= set(font.getBestCmap() or ())
     assert len(embedded[1]) < 60_000
     assert ElementTree.parse(tmp_path / "a.svg").getroot().tag.endswith("svg")
 
@@ -331,7 +331,7 @@ def test_colours_of_chasers_stand_for_nothing_else(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 8, chasers=2)
     flight, traces = load_flight(log), load_traces(log, ONE)
     forces, outcomes = inputs(flight, traces), cameras(flight, traces).axes[0]
-    steps = [patch.get_edgecolor() for axes in forces.axes for patch in axes.patches]
+    steps: list[Any] = [patch.get_edgecolor() for axes in forces.axes for patch in axes.patches]
     bars = [colour for bars in outcomes.collections for colour in bars.get_facecolor()]
     assert len(steps) == 2 * 3
     assert {to_hex(colour) for colour in (*steps, *bars)}.isdisjoint(SERIES)

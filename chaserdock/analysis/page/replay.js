@@ -166,7 +166,7 @@
       const [a] = place(time);
       by("replay-row-" + c.id).replaceChildren(...[
         "chaser " + c.id, at(c.phase, time) || "–", Math.hypot(...minus(poses[k].p, target.p)).toFixed(3) + " m",
-        a < c.error_mm.length ? c.error_mm[a].toPrecision(3) + " mm" : "–", at(c.outcome, time) || "–",
+        a < c.error_mm.length ? c.error_mm[a].toFixed(c.error_mm[a] < 10 ? 2 : 0) + " mm" : "–", at(c.outcome, time) || "–",
       ].map((text, n) => {
         const cell = document.createElement(n ? "td" : "th");
         cell.textContent = text;

@@ -21,6 +21,10 @@ from matplotlib.patches import StepPatch
 
 from .plots import css_colour
 
+_MOST_POINTS = 3000
+"""Largest number of points of a curve: three a pixel. Larger: the zoom shows more of a long flight,
+larger page.
+"""
 TIME = "time / s"
 """Label of an axis of time."""
 
@@ -51,7 +55,7 @@ class ChartData:
         box, curves, limits = axes.get_position(), list[dict[str, Any]](), list[dict[str, Any]]()
         named: dict[str, str] = {}
         for line in axes.get_lines():
-            x, y = (np.asarray(values, dtype=float) for values in line.get_data())
+            x, y = (_thinned(values) for values in line.get_data())
             colour = css_colour(to_hex(line.get_color()))
             if len(x) > 2:
                 label = (
@@ -81,8 +85,8 @@ class ChartData:
                         "dashed": False,
                         "dots": False,
                         "steps": True,
-                        "x": self._array(edges[:-1]),
-                        "y": self._array(values),
+                        "x": self._array(_thinned(edges[:-1])),
+                        "y": self._array(_thinned(values)),
                     }
                 )
         low, high = axes.get_ylim()
@@ -96,6 +100,11 @@ class ChartData:
             "curves": curves,
             "limits": limits,
         }
+
+
+def _thinned(values: Any) -> Array:
+    step = -(-len(values) // _MOST_POINTS)
+    return np.asarray(values, dtype=float)[:: max(step, 1)]
 
 
 def _is_over_time(axes: Axes) -> bool:

@@ -234,7 +234,7 @@ def _span_of(errors: Array, time_s: Array, from_s: float) -> float:
     """Return the largest magnitude since ``from_s``, or in the later half of a shorter series: a
     transient before it does not set a scale. Positive.
     """
-    late = errors[time_s >= min(from_s, float(time_s[-1]) / 2.0)]
+    late = errors[time_s >= min(from_s, float(time_s[-1]) / 2.0)] if len(time_s) else np.zeros(1)
     return max(float(np.max(np.abs(late))), 1e-3)
 
 
@@ -360,7 +360,7 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
             for axes, shown in ((whole, np.maximum(values[d], 1e-4)), (late, values[d])):
                 axes.plot(time_s[d], shown, color=colour(i), label=f"chaser {i}")
             reach = max(reach, _span_of(values, time_s, s.settling_s))
-            least = min(least, float(np.median(values)))
+            least = min(least, float(np.median(values))) if len(values) else least
         # A start on the reference, and passages through it, do not set the scale.
         whole.set(yscale="log", ylabel=label, ylim=(max(0.05 * least, 1e-4), None))
         late.set_ylabel(label)

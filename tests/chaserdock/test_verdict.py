@@ -23,6 +23,7 @@ from chaserdock.analysis.report import report_of
 from chaserdock.analysis.summary import summarize, summary_of, text_of
 from chaserdock.api import RunResult
 from chaserdock.cli.main import app
+from chaserdock.criterion import COLUMNS
 from chaserdock.experiments.campaign_report import sections
 from chaserdock.experiments.page import html, markdown
 from chaserdock.experiments.plan import ExperimentPlan, PlannedFlight
@@ -142,6 +143,7 @@ def test_terminal_and_judge_say_all_of_the_verdict(log: Path) -> None:
     assert said(text_of(summarize(log))) == []
     judged = CliRunner().invoke(app, ["judge", str(log)])
     assert (judged.exit_code, said(judged.output)) == (0, [])
+    assert max(map(len, judged.output.splitlines())) <= COLUMNS
     values = json.loads(CliRunner().invoke(app, ["judge", str(log), "--json"]).output)
     assert verdict_of(values).lines() == verdict_of(summarize(log)).lines()
 

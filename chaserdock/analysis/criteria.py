@@ -108,7 +108,7 @@ def _loads(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
         for quantity, limit, unit in _load_limits(s, int(i)):
             load, what = c["capture"]["port_load"], quantity.split("_")[1]
             value, note = None if load is None else load[quantity], ""
-            if load is not None and value > limit:
+            if load is not None and load[quantity] > limit:
                 note = f"exceeded from {load['limit_exceeded_s']:.2f} s on"
             yield criterion(
                 "loads on the ports", f"{what} on the port", value, limit, unit, int(i), note=note

@@ -334,7 +334,8 @@ def test_colours_of_chasers_stand_for_nothing_else(tmp_path: Path) -> None:
     steps: list[Any] = [patch.get_edgecolor() for axes in forces.axes for patch in axes.patches]
     bars = [colour for bars in outcomes.collections for colour in bars.get_facecolor()]
     assert len(steps) == 2 * 3
-    assert {to_hex(colour) for colour in (*steps, *bars)}.isdisjoint(SERIES)
+    drawn: list[Any] = [*steps, *bars]
+    assert {to_hex(colour) for colour in drawn}.isdisjoint(SERIES)
 
 
 def phases_flight(path: Path, chasers: int) -> RecordedFlight:

@@ -10,6 +10,7 @@ import msgspec
 from chaserdock_protocol.messages import DrawnBody
 from msgspec import Struct
 
+from .criterion import Criterion
 from .verdict import Verdict, verdict_of
 
 
@@ -227,6 +228,7 @@ class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     success: bool
     failures: list[str]
     not_judged: list[str]
+    criteria: list[Criterion] = []
     doubts: list[str] = []
     ended: str = ""
     log_lacks: list[str] = []

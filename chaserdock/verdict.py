@@ -6,9 +6,13 @@ pages render.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Any, Literal
+
+import msgspec
+
+from .criterion import Criterion, html_table
 
 NEES_BAND = (3.0, 12.0)
 """Mean NEES of a pose (6 expected) that is not remarked on: half to twice the expectation. Wider:
@@ -22,7 +26,8 @@ class Verdict:
 
     ``ended``: why the flight ended; empty if that is not known. ``not_met``, ``not_judged``:
     criteria of the scenario. ``doubts``: estimates whose errors do not fit their covariance.
-    ``lacking``: what the log lacks of its mission.
+    ``lacking``: what the log lacks of its mission. ``criteria``: all of them, as rows of a table;
+    empty for a flight without, or of an earlier version.
     """
 
     success: bool
@@ -31,6 +36,7 @@ class Verdict:
     not_judged: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
     lacking: tuple[str, ...] = ()
+    criteria: tuple[Criterion, ...] = ()
 
     @property
     def level(self) -> Literal["good", "partial", "bad"]:
@@ -62,14 +68,22 @@ class Verdict:
         ended = [f"ended: {self.ended}"] if self.ended else []
         return [*ended, *(f"{kind}: {text}" for kind, text in self.remarks())]
 
+    def lines_beside_table(self) -> list[str]:
+        """Return the lines that the table of the criteria does not show."""
+        return replace(self, not_met=(), not_judged=()).lines() if self.criteria else self.lines()
+
     def badge(self) -> str:
         """Return the headline as an HTML element of class ``verdict`` and the level."""
         return f'<span class="verdict {self.level}">{escape(self.headline)}</span>'
 
-    def html(self) -> str:
-        """Return the lines as an HTML list of class ``verdict-lines``; empty without any."""
-        items = "".join(f"<li>{escape(line)}</li>" for line in self.lines())
-        return f'<ul class="verdict-lines">{items}</ul>' if items else ""
+    def html(self, table: bool = False) -> str:
+        """Return the lines as an HTML list of class ``verdict-lines``; empty without any.
+        ``table``: with the table of the criteria.
+        """
+        lines = self.lines_beside_table() if table else self.lines()
+        items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+        text = f'<ul class="verdict-lines">{items}</ul>' if items else ""
+        return text + html_table(self.criteria) if table else text
 
 
 def verdict_of(summary: Mapping[str, Any]) -> Verdict:
@@ -86,6 +100,7 @@ def verdict_of(summary: Mapping[str, Any]) -> Verdict:
         not_judged=tuple(summary.get("not_judged", ())),
         doubts=tuple(summary.get("doubts", ())),
         lacking=tuple(summary.get("log_lacks", ())),
+        criteria=msgspec.convert(summary.get("criteria", ()), tuple[Criterion, ...]),
     )
 
 

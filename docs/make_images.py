@@ -814,7 +814,7 @@ def report() -> None:
         log = str(logs / "docking-contact" / "run")
         chaserdock("report", log, "--figures", "--out", name, "--format", "png")
         tiles = []
-        for figure in ("trajectories", "docking", "tracking", "thrusters"):
+        for figure in ("approach", "docking", "tracking", "effort"):
             image = np.asarray(cv2.imread(str(out / f"{figure}.png")))
             scale = min(480 / image.shape[1], 260 / image.shape[0])
             small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

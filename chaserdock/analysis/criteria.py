@@ -5,18 +5,23 @@ judged; docking and goals.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Vector3
 from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.mission import Success
+from msgspec import structs
+
+from chaserdock.criterion import Criterion, criterion
 
 from .flight import LoadHistory, RecordedFlight, SensedDocking
 from .motion import TARGET
+from .rendezvous import rendezvous_criteria
+from .stack import stack_motion
 
 _CONTACT_SLACK_M = 0.02
 """Distance (m) by which a chaser in contact may be closer than a latched one, because it tilts and
@@ -97,24 +102,17 @@ def _load_limits(s: Scenario, chaser: int) -> list[tuple[str, float, str]]:
     return [(quantity, limit, unit) for quantity, limit, unit in limits if limit is not None]
 
 
-def overloads(result: dict[str, Any], s: Scenario) -> list[str]:
-    """Return a message for each load limit that was exceeded, or cannot be judged."""
-    out = []
+def _loads(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
+    """Yield the load limits of the ports; a load that is not in the log violates its limit."""
     for i, c in result["chasers"].items() if result["collisions"] is not None else ():
         for quantity, limit, unit in _load_limits(s, int(i)):
             load, what = c["capture"]["port_load"], quantity.split("_")[1]
-            if load is None:
-                out.append(
-                    f"chaser {i}: largest {what} on its port: unknown, at most {limit:g} {unit} "
-                    "allowed"
-                )
-            elif load[quantity] > limit:
-                out.append(
-                    f"chaser {i}: largest {what} on its port: {load[quantity]:.4g} {unit}, at most "
-                    f"{limit:g} {unit} allowed; "
-                    f"exceeded from {load['limit_exceeded_s']:.2f} s on"
-                )
-    return out
+            value, note = None if load is None else load[quantity], ""
+            if load is not None and load[quantity] > limit:
+                note = f"exceeded from {load['limit_exceeded_s']:.2f} s on"
+            yield criterion(
+                "loads on the ports", f"{what} on the port", value, limit, unit, int(i), note=note
+            )
 
 
 def nearest_allowed_m(s: Scenario, chaser: int) -> float:
@@ -128,20 +126,26 @@ def nearest_allowed_m(s: Scenario, chaser: int) -> float:
     return min(limit, latched_m - _CONTACT_SLACK_M)
 
 
-def capture_failures(result: dict[str, Any], s: Scenario) -> list[str]:
-    """Return a message for each chaser that should be latched and verified but is not."""
-    out = []
+def _captures(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
+    """Yield ``success.latched`` for each of its chasers."""
     for i in s.success.latched:
-        capture = result["chasers"].get(str(i), {}).get("capture")
-        if capture is None or not capture["latched"]:
-            refused = capture["refused"] if capture else []
-            out.append(
-                f"chaser {i} is not latched"
-                + (f"; last rejected touch: {refused[-1]}" if refused else "")
-            )
-        elif not capture["verified"]:
-            out.append(f"chaser {i} is latched but not verified by a pull test")
-    return out
+        capture = result["chasers"].get(str(i), {}).get("capture") or {}
+        latched, verified = capture.get("latched", False), capture.get("verified", False)
+        note = ""
+        if not latched and capture.get("refused"):
+            note = f"last rejected touch: {capture['refused'][-1]}"
+        elif latched and not verified:
+            note = "latched, but not verified by a pull test"
+        yield criterion(
+            "latched",
+            "latched and verified",
+            capture["latch_time_s"] if latched else None,
+            result["sim_time_s"],
+            "s",
+            i,
+            note=note,
+            met=latched and verified,
+        )
 
 
 def capture_state(capture: dict[str, Any]) -> str:
@@ -160,7 +164,7 @@ def capture_text(capture: dict[str, Any]) -> str:
     return (
         f"; {capture_state(capture)}, latched at {capture['latch_time_s']:.1f} s: "
         f"{capture['contact_lateral_m'] * 1e3:.2f} mm and "
-        f"{np.degrees(capture['contact_angle_rad']):.2f} deg off, closing at "
+        f"{np.degrees(capture['contact_angle_rad']):.2f}° off, closing at "
         f"{capture['contact_closing_m_s'] * 1e3:.1f} mm/s"
     )
 
@@ -172,53 +176,34 @@ def stack_rest(flight: RecordedFlight) -> dict[str, float | None] | None:
     ``since_s``: simulated time since which both were within ``success.detumbled``; None if they are
     not at the end.
     """
-    names = ["target", *(f"chaser/{i}" for i in flight.latched)]
     limits = flight.scenario.success.detumbled
-    if limits is None or any(name not in flight.motion for name in names):
+    stack = None if limits is None else stack_motion(flight, dict.fromkeys(flight.latched))
+    if limits is None or stack is None:
         return None
-    if not flight.motion.has_rates():
-        return None
-    tracks = {name: flight.motion[name] for name in names}
-    n = min(len(track.time_s) for track in tracks.values())
-    momentum, mass = np.zeros((n, 3)), 0.0
-    for name, track in tracks.items():
-        mass_kg, centre_m = _mass_and_centre(flight, name)
-        turning = np.cross(track.omega_rad_s[:n], centre_m)
-        momentum += mass_kg * (track.velocity_m_s[:n] + rotations.rotate(track.q_wxyz[:n], turning))
-        mass += mass_kg
-    speed = np.linalg.norm(momentum, axis=1) / mass
-    rate = np.linalg.norm(tracks["target"].omega_rad_s[:n], axis=1)
+    speed, rate, n = stack.speed_m_s, stack.rate_rad_s, len(stack.time_s)
     outside = np.flatnonzero((speed > limits.speed_m_s) | (rate > np.radians(limits.rate_deg_s)))
     first = int(outside[-1]) + 1 if len(outside) else 0
     return {
         "speed_m_s": float(speed[-1]),
         "rate_rad_s": float(rate[-1]),
-        "since_s": float(tracks["target"].time_s[first]) if first < n else None,
+        "since_s": float(stack.time_s[first]) if first < n else None,
     }
 
 
-def _mass_and_centre(flight: RecordedFlight, name: str) -> tuple[float, Vector3]:
-    """Return mass, kg, and centre of mass, m, of a body: the true ones, or else those stated."""
-    for drawn in flight.drawn:
-        if drawn.body == name:
-            return drawn.mass_kg, drawn.centre_of_mass_m
-    if name == TARGET:
-        return flight.scenario.target.mass_kg, flight.scenario.target.centre_of_mass_m
-    return flight.scenario.chaser.mass_kg, (0.0, 0.0, 0.0)
-
-
-def rest_failures(result: dict[str, Any], s: Scenario) -> list[str]:
-    """Return the violations of ``success.detumbled``."""
+def _rest(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
+    """Yield ``success.detumbled``."""
     limits, stack = s.success.detumbled, result.get("stack")
-    if limits is None or (stack is not None and stack["since_s"] is not None):
-        return []
-    if stack is None:
-        return ["success.detumbled: the motion of the stack is not in the log"]
-    return [
-        f"the stack moves at {stack['speed_m_s'] * 1e3:.2f} mm/s and "
-        f"{np.degrees(stack['rate_rad_s']):.3f} degrees/s; at most "
-        f"{limits.speed_m_s * 1e3:g} mm/s and {limits.rate_deg_s:g} degrees/s allowed"
-    ]
+    if limits is None:
+        return
+    values, note = (None, None), "the motion of the stack is not in the log"
+    if stack is not None:
+        values = (stack["speed_m_s"] * 1e3, math.degrees(stack["rate_rad_s"]))
+        since_s = stack["since_s"]
+        note = "" if since_s is None else f"both within their limits since {since_s:.2f} s"
+    yield criterion(
+        "detumbled", "speed of the stack", values[0], limits.speed_m_s * 1e3, "mm/s", note=note
+    )
+    yield criterion("detumbled", "rate of the stack", values[1], limits.rate_deg_s, "°/s")
 
 
 def reached_time(flight: RecordedFlight, chaser: int) -> float | None:
@@ -240,22 +225,129 @@ def reached_time(flight: RecordedFlight, chaser: int) -> float | None:
     return float(target.time_s[first]) if first < len(away) else None
 
 
-def not_reached(scenario: Scenario, chaser: int, time_s: float | None) -> list[str]:
-    """Return the violations of ``success.reached``. ``time_s``: time since which the chaser stayed
-    at its goal, or None.
+def _poses(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
+    """Yield the criteria on the motion of each chaser that is known."""
+    success, end_s = s.success, result["sim_time_s"]
+    for number, c in result["chasers"].items():
+        i = int(number)
+        if (distance := c["min_distance_target_m"]) is None:
+            continue
+        if success.keep_distances:
+            limit_m = nearest_allowed_m(s, i)
+            yield criterion(
+                "keep_distances", "distance to target", distance, limit_m, "m", i, "at least"
+            )
+        if i in success.docked:
+            held_s = s.approach.docked_time_s
+            yield criterion(
+                "docked",
+                "docking pose since",
+                c["dock_time_s"],
+                end_s - held_s,
+                "s",
+                i,
+                note=f"to the end; the controller reports docked after {held_s:g} s in the pose",
+                met=c["docked"],
+            )
+        if i in success.reached and (goal := s.goal_of(i)) is not None:
+            within_s = success.reached_within_s
+            yield criterion(
+                "reached",
+                "at its goal since",
+                c["reached_time_s"],
+                end_s if within_s is None else goal[0] + within_s,
+                "s",
+                i,
+                note=f"to the end, within {success.reached_position_m * 1e3:g} mm",
+            )
+        errors = (c["steady"][k] for k in ("position_mse_m2", "orientation_mse_rad2"))
+        position, angle = (None if e is None else math.sqrt(e) for e in errors)
+        yield from _pose_limits(
+            "steady_{}_rms", "steady {} RMS", position, angle, success, chaser=i
+        )
+
+
+def _pose_limits(
+    key: str,
+    name: str,
+    position_m: float | None,
+    angle_rad: float | None,
+    success: Success,
+    chaser: int | None,
+) -> Iterator[Criterion]:
+    """Yield the limits of a pose error that the scenario states. ``key``, ``name``: with braces for
+    position or orientation.
     """
-    success, goal = scenario.success, scenario.goal_of(chaser)
-    if chaser not in success.reached or goal is None:
-        return []
-    if time_s is None:
-        return [f"chaser {chaser} is not within {success.reached_position_m:g} m of its goal"]
-    took_s = time_s - goal[0]
-    if success.reached_within_s is not None and took_s > success.reached_within_s:
-        return [
-            f"chaser {chaser} reached its goal after {took_s:.1f} s, at most "
-            f"{success.reached_within_s:g} s allowed"
-        ]
-    return []
+    for what, key_unit, value, factor, unit in (
+        ("position", "m", position_m, 1e3, "mm"),
+        ("orientation", "deg", None if angle_rad is None else math.degrees(angle_rad), 1.0, "°"),
+    ):
+        found = f"{key.format(what)}_{key_unit}"
+        if (limit := getattr(success, found)) is not None:
+            measured = None if value is None else value * factor
+            yield criterion(found, name.format(what), measured, limit * factor, unit, chaser)
+
+
+def _estimates(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
+    """Yield the limits of the estimated poses relative to the target.
+
+    An estimator that publishes none treats the odometry of the chasers as exact, and is judged by
+    the target's pose.
+    """
+    relative = {
+        int(i): c["relative_estimate"]
+        for i, c in result["chasers"].items()
+        if "relative_estimate" in c
+    }
+    for i, e in (relative or {None: result["target_estimate"]}).items():
+        errors = e["max_position_error_m"], e["max_orientation_error_rad"]
+        yield from _pose_limits("max_estimate_{}", "{} estimate", *errors, s.success, chaser=i)
+
+
+def _flight(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
+    """Yield the criteria on the flight as a whole."""
+    flown_s = result["sim_time_s"]
+    yield criterion(
+        "duration_s",
+        "flown",
+        flown_s,
+        s.duration_s,
+        "s",
+        side="at least",
+        note="" if flown_s >= s.duration_s else result["ended"],
+        met=flown_s >= s.duration_s - 1.0 / s.time.rate_hz,
+    )
+    if (hits := result["collisions"]) is not None:
+        yield criterion("collisions", "collisions", hits, 0, "")
+    nearest = result["min_distance_chasers_m"]
+    if s.success.keep_distances and nearest is not None:
+        limit_m = s.limits.min_distance_chasers_m
+        yield criterion("keep_distances", "between chasers", nearest, limit_m, "m", side="at least")
+
+
+_PARTS = (_flight, _poses, _captures, _loads, _rest, rendezvous_criteria, _estimates)
+
+
+def judge(result: dict[str, Any], s: Scenario, skipped: Sequence[str] = ()) -> list[Criterion]:
+    """Judge a summary by the criteria of its scenario. ``skipped``: see ``criteria_of``; each is a
+    row, which states its limit if the scenario has it.
+    """
+    parts = (line.partition(": ") for line in skipped)
+    reasons = {what: why for what, _, why in parts}
+    rows, used = list[Criterion](), set[str]()
+    for row in (row for part in _PARTS for row in part(result, s)):
+        keys = (f"success.{row.key}, chaser {row.chaser}", f"success.{row.key}", row.key)
+        key = next((key for key in keys if key in reasons), None)
+        if key is not None:
+            used.add(key)
+            row = structs.replace(row, outcome="not judged", measured=None, note=reasons[key])
+        rows.append(row)
+    for what, why in reasons.items():
+        if what not in used:
+            name, _, chaser = what.removeprefix("success.").partition(", chaser ")
+            name, i = name.replace("_", " "), int(chaser) if chaser.isdigit() else None
+            rows.append(Criterion(key=what, name=name, outcome="not judged", chaser=i, note=why))
+    return rows
 
 
 _OF_POSES = (

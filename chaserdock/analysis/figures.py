@@ -19,18 +19,22 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.errors import errors_of_writing
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from .approach import approach_of
 from .flight import RecordedFlight, load_flight
 from .mass_properties import NAMES, SCALE, stated_values, true_values
 from .motion import TARGET, Track
 from .plots import (
     AXES_XYZ,
     FAINT,
+    GOOD,
+    GRID,
+    INK,
     LIMIT,
-    SERIES,
     MissingData,
     colour,
     dashes,
@@ -43,7 +47,14 @@ from .plots import (
     styled,
 )
 from .pose_errors import chi_square_band
-from .summary import estimate_errors, known_estimates, tracking_components, tracking_errors
+from .stack import stack_motion
+from .summary import (
+    estimate_errors,
+    known_estimates,
+    relative_errors,
+    tracking_components,
+    tracking_errors,
+)
 from .time_series import OUTCOMES, ImageOutcome, ImageOutcomes, Traces, load_traces
 
 Drawing = Callable[[RecordedFlight, Traces], Figure]
@@ -156,67 +167,228 @@ def _equal_scale(axes: Any, paths: list[Array]) -> None:
     axes.set_box_aspect(half, zoom=1.0)
 
 
-def _mark_phases(axes: Axes, flight: RecordedFlight, labelled: bool) -> None:
-    """Mark the phase changes of all chasers by thin lines, labelled once."""
-    changes: dict[tuple[float, str], None] = {}
-    for history in flight.references.values():
-        changes |= dict.fromkeys(history.phases[1:])
-    for time_s, name in changes:
-        axes.axvline(time_s, color=FAINT, linewidth=0.7, linestyle=":")
-        if labelled:
-            axes.annotate(
-                name,
-                (time_s, 1.0),
-                xycoords=("data", "axes fraction"),
-                xytext=(2, -9),
-                textcoords="offset points",
-                fontsize=7.5,
-                color=FAINT,
+_STRIP_ROW_IN = 0.17
+"""Height (in) of a chaser's row of phases: that of its text and a gap. Smaller: labels touch."""
+_LETTER_IN = 0.062
+"""Width (in) of a letter of a phase's name. Smaller: names overrun their bars; larger: fewer have a
+name.
+"""
+
+
+def _timed_figure(
+    flight: RecordedFlight, rows: int, columns: int = 1, height: float = 2.1
+) -> tuple[Figure, list[Axes]]:
+    """Create a figure over time, with the phases of each chaser above its panels; return it and
+    the panels row by row. ``height`` of one row in inches.
+    """
+    histories = flight.references
+    strip_in = 0.12 + _STRIP_ROW_IN * len(histories)
+    figure = Figure(figsize=(9.6, 0.5 + strip_in + height * rows))
+    axes: Any = figure.subplots(
+        rows + 1, columns, squeeze=False, sharex="col", height_ratios=[strip_in] + [height] * rows
+    )
+    width_in = 8.4 / columns
+    for strip in axes[0]:
+        strip.set_axis_off()
+    for column, strip in enumerate(axes[0]):
+        _draw_phases(strip, flight, width_in, named=column == 0)
+        for panel in axes[1:, column]:
+            for i, history in histories.items():
+                for time_s, _ in history.phases[1:]:
+                    panel.axvline(time_s, color=colour(i), linewidth=0.6, alpha=0.5, linestyle=":")
+        axes[-1, column].set_xlabel("time / s")
+    return figure, list(axes[1:].ravel())
+
+
+def _draw_phases(strip: Axes, flight: RecordedFlight, width_in: float, named: bool) -> None:
+    """Draw a row for each chaser, with a bar for each phase, named where the name fits. A name lies
+    within its bar, so that no two overlap. ``named``: with the numbers of the chasers.
+    """
+    end_s = max(flight.flown_s, 1e-3)
+    for row, (i, history) in enumerate(flight.references.items()):
+        ends = [begin_s for begin_s, _ in history.phases[1:]] + [end_s]
+        for k, ((begin_s, name), until_s) in enumerate(zip(history.phases, ends, strict=True)):
+            bar = [(begin_s, max(until_s - begin_s, 0.0))]
+            strip.broken_barh(bar, (row - 0.44, 0.88), color=colour(i), alpha=(0.3, 0.14)[k % 2])
+            if len(name) * _LETTER_IN < (until_s - begin_s) / end_s * width_in:
+                strip.text(
+                    begin_s + 0.004 * end_s, row, name, va="center", fontsize=7.5, clip_on=True
+                )
+        if named:
+            place = strip.get_yaxis_transform()
+            text = f"chaser {i} "
+            strip.text(
+                0.0,
+                row,
+                text,
+                transform=place,
+                ha="right",
+                va="center",
+                fontsize=8,
+                color=colour(i),
             )
+    strip.set(ylim=(max(len(flight.references), 1) - 0.5, -0.5), xlim=(0.0, end_s))
+
+
+def _span_of(errors: Array, time_s: Array, from_s: float) -> float:
+    """Return the largest magnitude since ``from_s``, or in the later half of a shorter series: a
+    transient before it does not set a scale. Positive.
+    """
+    late = errors[time_s >= min(from_s, float(time_s[-1]) / 2.0)] if len(time_s) else np.zeros(1)
+    return max(float(np.max(np.abs(late))), 1e-3)
+
+
+def _name_chasers(flight: RecordedFlight, axes: Axes) -> None:
+    """Place a legend above the axes of a figure without phases, which name the chasers."""
+    if not flight.references:
+        legend_above(axes)
+
+
+@_figure(
+    "Approach",
+    "Offset from the docking axis and closing speed over the range: of the probe's tip from its "
+    "port (0 at contact), without port of the chaser's centre from its docking pose. Time runs to "
+    "the right. Red: limits of corridor, last part and contact; crosses: at the touch.",
+)
+def approach(flight: RecordedFlight, _: Traces) -> Figure:
+    found = {i: a for i in flown(flight) if (a := approach_of(flight, i)) is not None}
+    if not found:
+        raise MissingData("no chaser has approached the target")
+    figure, panels = new_figure(1, 2, height=3.0)
+    for i, a in found.items():
+        for axes, values, limits in (
+            (panels[0], a.lateral_m, a.lateral_limits),
+            (panels[1], a.closing_m_s, a.closing_limits),
+        ):
+            axes.plot(
+                a.range_m * 1e3,
+                values * 1e3,
+                color=colour(i),
+                linestyle=dashes(i),
+                label=f"chaser {i}",
+            )
+            for limit in limits:
+                ends = (limit.from_m * 1e3, limit.to_m * 1e3)
+                style = {"marker": "D", "markersize": 4} if ends[0] == ends[1] else {}
+                axes.plot(ends, (limit.value * 1e3,) * 2, color=LIMIT, linewidth=1.1, **style)
+    for touch in flight.world.touches:
+        if touch.chaser in found and touch.latched:
+            for axes, value in ((panels[0], touch.lateral_m), (panels[1], touch.closing_m_s)):
+                axes.plot(0.0, value * 1e3, "x", color=colour(touch.chaser), markersize=6)
+    for axes, kind, label in (
+        (panels[0], "lateral_limits", "lateral offset / mm"),
+        (panels[1], "closing_limits", "closing speed / mm s⁻¹"),
+    ):
+        most = max(limit.value for a in found.values() for limit in getattr(a, kind)) * 1e3
+        axes.set(xlabel="range / mm", ylabel=label)
+        axes.set_ylim(0.0 if axes is panels[0] else -0.5 * most, 1.6 * most)
+        axes.xaxis.set_inverted(True)
+    legend_above(panels[0])
+    return figure
+
+
+@_figure(
+    "Motion of the stack",
+    "Rate of the target, angular momentum of the stack (the target with the chasers latched at "
+    "that time) about its centre of mass, and speed of that centre; dashed: limits of a stopped "
+    "one.",
+)
+def stack(flight: RecordedFlight, _: Traces) -> Figure:
+    if not flight.latched:
+        raise MissingData("no chaser is latched to the target at the end")
+    times = flight.motion[TARGET].time_s if TARGET in flight.motion else np.zeros(0)
+    members = {i: flight.latched_during(i, times) for i in flight.latched}
+    motion = stack_motion(flight, members) if len(times) else None
+    if motion is None:
+        raise MissingData("the log has no motion with rates of target and latched chasers")
+    figure, panels = _timed_figure(flight, 3, height=1.6)
+    d = decimated(len(motion.time_s))
+    limits = flight.scenario.success.detumbled
+    for axes, values, label, limit in (
+        (
+            panels[0],
+            np.degrees(motion.rate_rad_s),
+            "rate / ° s⁻¹",
+            limits and limits.rate_deg_s,
+        ),
+        (panels[1], motion.angular_momentum_N_m_s, "angular\nmomentum / N m s", None),
+        (
+            panels[2],
+            motion.speed_m_s * 1e3,
+            "speed / mm s⁻¹",
+            limits and limits.speed_m_s * 1e3,
+        ),
+    ):
+        axes.plot(motion.time_s[d], values[d], color=INK)
+        axes.set_ylabel(label)
+        if limit is None:
+            axes.set_ylim(0.0, None)
+        else:  # a limit is a hundredth of what was stopped, and less
+            axes.set_yscale("log")
+            _plain_numbers(axes.yaxis)
+            unit = label.partition(" / ")[2]
+            limit_line(axes, limit, f"stopped: {limit:g} {unit}; at the end {values[-1]:.2g}")
+    panels[0].set_xlim(_span_s(motion.time_s))
+    return figure
 
 
 @_figure(
     "Tracking errors",
     "Distance and angle of each chaser from its reference pose on the true target; without ground "
-    "truth and reference, of its odometry from its reference pose on the estimated target. Shaded: "
-    "steady-state interval.",
+    "truth and reference, of its odometry from its reference pose on the estimated target. Left: "
+    "whole flight, logarithmic. Right: linear, with the scale of the part after settling; the "
+    "transient is cut off. Shaded: steady-state interval.",
 )
 def tracking(flight: RecordedFlight, _: Traces) -> Figure:
     errors = {i: table.T for i, table in flight.estimated_errors.items()}
     if flight.shown or not errors:
         errors = {i: tracking_errors(flight, i) for i in flown(flight)}
-    figure, (top, bottom) = new_figure(2, sharex=True)
+    figure, panels = _timed_figure(flight, 2, 2)
     s = flight.scenario
-    for i, (time_s, position, angle) in errors.items():
-        d = decimated(len(time_s))
-        top.semilogy(time_s[d], np.maximum(position[d], 1e-7), color=colour(i), label=f"chaser {i}")
-        bottom.semilogy(time_s[d], np.maximum(np.degrees(angle[d]), 1e-5), color=colour(i))
-    for axes, limit, unit in (
-        (top, s.success.steady_position_rms_m, "m"),
-        (bottom, s.success.steady_orientation_rms_deg, "°"),
-    ):
-        axes.axvspan(
-            s.settling_s, s.steady_until_s or s.duration_s, color=FAINT, alpha=0.08, linewidth=0
+    position_mm, angle_deg = s.success.steady_position_rms_m, s.success.steady_orientation_rms_deg
+    for row, (factor, limit, unit, label) in enumerate(
+        (
+            (1e3, None if position_mm is None else position_mm * 1e3, "mm", "position error / mm"),
+            (np.degrees(1.0), angle_deg, "°", "orientation error / °"),
         )
-        _mark_phases(axes, flight, axes is top)
+    ):
+        whole, late = panels[2 * row : 2 * row + 2]
+        reach, least = 0.0, np.inf
+        for i, (time_s, *both) in errors.items():
+            d = decimated(len(time_s))
+            values = both[row] * factor
+            for axes, shown in ((whole, np.maximum(values[d], 1e-4)), (late, values[d])):
+                axes.plot(time_s[d], shown, color=colour(i), label=f"chaser {i}")
+            reach = max(reach, _span_of(values, time_s, s.settling_s))
+            least = min(least, float(np.median(values))) if len(values) else least
+        # A start on the reference, and passages through it, do not set the scale.
+        whole.set(yscale="log", ylabel=label, ylim=(max(0.05 * least, 1e-4), None))
+        late.set_ylabel(label)
+        _plain_numbers(whole.yaxis)
+        late.set_ylim(0.0, 1.15 * reach)
+        for axes in (whole, late):
+            axes.axvspan(
+                s.settling_s, s.steady_until_s or s.duration_s, color=FAINT, alpha=0.08, linewidth=0
+            )
         if limit is not None:
-            limit_line(axes, limit, f"RMS limit in the shaded interval: {limit:g} {unit}")
-    if flight.motion.source == "reference":
-        sigma_m, sigma_rad = flight.motion.sigmas()
-        limit_line(top, max(sigma_m, 1e-7), "reference, 1 sigma")
-        limit_line(bottom, max(np.degrees(sigma_rad), 1e-5), "reference, 1 sigma")
+            limit_line(whole, limit, f"RMS limit {limit:g} {unit}")
+            if limit < 1.5 * reach:
+                late.set_ylim(0.0, 1.15 * max(reach, limit))
+                limit_line(late, limit, f"RMS limit {limit:g} {unit}")
+        if flight.motion.source == "reference":
+            sigma = flight.motion.sigmas()[row] * factor
+            limit_line(whole, max(sigma, 1e-4), "reference, 1 sigma")
     last_s = max(float(time_s[-1]) for time_s, *_ in errors.values() if len(time_s))
-    top.set(ylabel="position error / m", xlim=_span_s(np.array([last_s])))
-    bottom.set(ylabel="orientation error / °", xlabel="time / s")
-    legend_above(top)
+    for axes in panels[:2]:
+        axes.set_xlim(_span_s(np.array([last_s])))
+    _name_chasers(flight, panels[0])
     return figure
 
 
 @_figure(
     "Tracking errors by axis",
     "Pose of each chaser minus its reference pose on the true target: position in target axes, "
-    "orientation as a rotation vector "
-    "in chaser axes.",
+    "orientation as a rotation vector in chaser axes. The scale is that after settling.",
 )
 def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
@@ -226,8 +398,7 @@ def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
     for i in numbers:
         time_s, position, turn = tracking_components(flight, i, step)
         for row, values in enumerate((position * 1e3, np.degrees(turn))):
-            # Transients after commands may exceed the scale.
-            reach[row] = max(reach[row], 1.4 * float(np.percentile(np.abs(values), 98.0)), 1e-3)
+            reach[row] = max(reach[row], 1.2 * _span_of(values, time_s, flight.scenario.settling_s))
             for k in range(3):
                 axes[3 * row + k].plot(
                     time_s,
@@ -298,7 +469,7 @@ def keep_out(flight: RecordedFlight, chaser: int) -> tuple[Array, Array]:
 )
 def docking(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
-    figure, (top, bottom) = new_figure(2, sharex=True)
+    figure, (top, bottom) = _timed_figure(flight, 2)
     s, target = flight.scenario, flight.motion[TARGET]
     nearest, fastest = np.inf, 0.0
     for i in numbers:
@@ -322,12 +493,10 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
             top, s.approach.dock_distance_m, f"docking distance {s.approach.dock_distance_m:g} m"
         )
     top.set(ylabel="distance to the target / m", ylim=(nearest * 0.5, None))
-    bottom.set(ylabel="closing speed / mm s⁻¹", xlabel="time / s", xlim=_span_s(target.time_s))
+    bottom.set(ylabel="closing speed / mm s⁻¹", xlim=_span_s(target.time_s))
     fastest = fastest or s.approach.max_speed_m_s * 1e3
     bottom.set_ylim(-fastest, 2.0 * fastest)
-    for axes in (top, bottom):
-        _mark_phases(axes, flight, axes is top)
-    legend_above(top)
+    _name_chasers(flight, top)
     return figure
 
 
@@ -349,7 +518,7 @@ def _docks_at_distance(flight: RecordedFlight, chaser: int) -> bool:
 def loads(flight: RecordedFlight, _: Traces) -> Figure:
     if not any(history.of("peak_force_N").any() for history in flight.loads.values()):
         raise MissingData("no chaser has loaded a port")
-    figure, (top, bottom) = new_figure(2, sharex=True)
+    figure, (top, bottom) = _timed_figure(flight, 2)
     for i, history in flight.loads.items():
         d = decimated(len(history.time_s))
         time_s, style = history.time_s[d], dashes(i)
@@ -371,18 +540,15 @@ def loads(flight: RecordedFlight, _: Traces) -> Figure:
         bottom.plot(time_s, history.of("peak_torque_N_m")[d], color=colour(i), linestyle=style)
     end_s = max(float(history.time_s[-1]) for history in flight.loads.values())
     top.set(ylabel="force / N", ylim=(0.0, None))
-    bottom.set(
-        ylabel="torque / N m", xlabel="time / s", xlim=(0.0, max(end_s, 1e-3)), ylim=(0.0, None)
-    )
+    bottom.set(ylabel="torque / N m", xlim=(0.0, max(end_s, 1e-3)), ylim=(0.0, None))
     ports = [port for i in flight.loads if (port := flight.scenario.docking.port_of(i)) is not None]
     for axes, limits, unit in (
         (top, {port.force_limit_N for port in ports}, "N"),
         (bottom, {port.torque_limit_N_m for port in ports}, "N m"),
     ):
-        _mark_phases(axes, flight, axes is top)
         for limit in sorted(x for x in limits if x is not None):
             limit_line(axes, limit, f"limit {limit:g} {unit}")
-    legend_above(top)
+    _name_chasers(flight, top)
     return figure
 
 
@@ -390,7 +556,7 @@ def loads(flight: RecordedFlight, _: Traces) -> Figure:
     "Identified mass properties",
     "Mass, centre of mass and inertia of the target alone, as identified in flight, with a band of "
     "two standard deviations; "
-    "dashed: true values; dotted: values stated in the scenario.",
+    "dashed: true values; dotted: values stated in the scenario. Products of inertia are thin.",
 )
 def identification(flight: RecordedFlight, _: Traces) -> Figure:
     found = flight.identified
@@ -400,22 +566,22 @@ def identification(flight: RecordedFlight, _: Traces) -> Figure:
     known = [(stated_values(flight.scenario), ":")]
     if drawn is not None:
         known.append((true_values(drawn), "--"))
-    figure, panels = new_figure(3, sharex=True)
+    figure, panels = _timed_figure(flight, 3)
     for axes, rows, label in (
         (panels[0], range(1), "mass / kg"),
         (panels[1], range(1, 4), "centre of mass / mm"),
         (panels[2], range(4, 10), "inertia / kg m²"),
     ):
         for n, k in enumerate(rows):
+            shade, width = AXES_XYZ[n % 3], 1.1 if n < 3 else 0.7  # products of inertia: thin
             value, sigma = found.values[:, k] * SCALE[k], found.sigmas[:, k] * SCALE[k]
-            axes.plot(found.time_s, value, color=colour(n), label=NAMES[k])
+            axes.plot(found.time_s, value, color=shade, linewidth=width, label=NAMES[k])
             band = (value - 2.0 * sigma, value + 2.0 * sigma)
-            axes.fill_between(found.time_s, *band, color=colour(n), alpha=0.15, linewidth=0.0)
+            axes.fill_between(found.time_s, *band, color=shade, alpha=0.15, linewidth=0.0)
             for values, style in known:
-                axes.axhline(values[k] * SCALE[k], color=colour(n), linestyle=style, linewidth=0.8)
+                axes.axhline(values[k] * SCALE[k], color=shade, linestyle=style, linewidth=0.8)
         axes.set(ylabel=label)
-        _mark_phases(axes, flight, axes is panels[0])
-    panels[2].set(xlabel="time / s", xlim=_span_s(found.time_s))
+    panels[2].set(xlim=_span_s(found.time_s))
     for axes in panels[1:]:
         legend_above(axes)
     return figure
@@ -447,50 +613,54 @@ def passive_safety(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
-@_figure("Separation of the chasers", "Distance between the centres of each pair of chasers.")
+@_figure(
+    "Separation of the chasers",
+    "Distance between the centres of each pair of chasers, in the colours of both.",
+)
 def separation(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     if len(numbers) < 2:
         raise MissingData("the mission has only one chaser")
     figure, (axes,) = new_figure(1, height=2.8)
-    for k, (i, j) in enumerate(combinations(numbers, 2)):
+    pairs: dict[str, Any] = {}
+    for i, j in combinations(numbers, 2):
         time_s, distance = flight.motion[f"chaser/{i}"].distance_to(flight.motion[f"chaser/{j}"])
         d = decimated(len(distance))
-        axes.plot(time_s[d], distance[d], color=colour(k), linestyle=dashes(k), label=f"{i}, {j}")
+        (one,) = axes.plot(time_s[d], distance[d], color=colour(i))
+        (other,) = axes.plot(time_s[d], distance[d], color=colour(j), linestyle=(0, (5, 5)))
+        pairs[f"{i}, {j}"] = (one, other)
     least = flight.scenario.limits.min_distance_chasers_m
     limit_line(axes, least, f"limit {least:g} m")
     axes.set(ylabel="distance / m", xlabel="time / s", ylim=(0, None))
     axes.set_xlim(_span_s(flight.motion[TARGET].time_s))
-    legend_above(axes)
+    if len(pairs) <= 6:  # more do not fit into a row
+        legend_above(axes, handles=list(pairs.values()), labels=list(pairs))
     return figure
 
 
 @_figure(
     "Actuator forces and torques",
     "Applied force and torque (without ground truth: as commanded), body axes, mean over each "
-    "tick; dashed: limits of the planned force and torque. Pulses of thrusters "
-    "may exceed them within a tick; dotted: all thrusters of an axis open.",
+    "tick. The scale is that after settling; dashed: limits of the planned force and torque, "
+    "dotted: all thrusters of an axis open, where they are within the scale.",
 )
 def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     if not traces.inputs:
         raise MissingData("the log holds fewer than two ticks of every chaser")
     body = flight.scenario.chaser
-    attainable = None
+    attainable = np.zeros(6)
     if body.actuation == "thrusters":
         thrusts_N = [thruster.thrust_N for thruster in body.thrusters]
         attainable = np.maximum(wrench_matrix(body.thrusters) * thrusts_N, 0.0).sum(axis=1)
-    largest = [
-        max(float(np.abs(v).max()) for v in pair)
-        for pair in zip(*((t.force_N, t.torque_N_m) for t in traces.inputs.values()), strict=True)
-    ]
     figure, axes = new_figure(len(traces.inputs), 2, height=1.55, sharex=True, sharey="col")
+    kinds = (
+        ("force / N", 1.0, body.force_max_N, attainable[:3]),
+        ("torque / mN m", 1e3, body.torque_max_N_m, attainable[3:]),
+    )
+    reach = [0.0, 0.0]
     for row, (i, applied) in enumerate(traces.inputs.items()):
-        for column, (values, limit) in enumerate(
-            (
-                (applied.force_N, body.force_max_N),
-                (applied.torque_N_m * 1e3, body.torque_max_N_m * 1e3),
-            )
-        ):
+        for column, (label, factor, limit, most) in enumerate(kinds):
+            values = (applied.torque_N_m if column else applied.force_N) * factor
             a = axes[2 * row + column]
             for k, name in enumerate("xyz"):
                 a.stairs(
@@ -501,16 +671,16 @@ def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
                     linewidth=0.9,
                     baseline=None,
                 )
-            unit = 1e3 if column else 1.0
+            span = _span_of(values, applied.edges_s[1:], flight.scenario.settling_s)
+            reach[column] = max(reach[column], 1.25 * span)
             for sign in (1.0, -1.0):
-                a.axhline(sign * limit, color=LIMIT, linestyle=(0, (5, 3)), linewidth=0.9)
-                for most in (
-                    () if attainable is None else np.unique(attainable[3 * column : 3 * column + 3])
-                ):
-                    a.axhline(sign * most * unit, color=LIMIT, linestyle=":", linewidth=0.9)
-            reach = 1.15 * max(limit, largest[column] * unit)
-            a.set_ylim(-reach, reach)
-            a.set_ylabel("torque / mN m" if column else f"chaser {i}\nforce / N")
+                a.axhline(sign * limit * factor, color=LIMIT, linestyle=(0, (5, 3)), linewidth=0.9)
+                for value in np.unique(most[most > 0.0]):
+                    a.axhline(sign * value * factor, color=LIMIT, linestyle=":", linewidth=0.9)
+            a.set_ylabel(label if column else f"chaser {i}\n{label}")
+    for column, (label, factor, limit, _) in enumerate(kinds):
+        axes[column].set_ylim(-reach[column], reach[column])
+        axes[column].set_title(f"limit {limit * factor:g} {label.partition(' / ')[2]}")
     axes[0].set_xlim(0, max(float(t.edges_s[-1]) for t in traces.inputs.values()))
     for a in axes[-2:]:
         a.set_xlabel("time / s")
@@ -518,8 +688,31 @@ def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     return figure
 
 
+@_figure(
+    "Impulse and velocity change",
+    "Time integral of the absolute force components of each chaser since the start; right: the "
+    "velocity change that it is worth, divided by the stated mass.",
+)
+def effort(flight: RecordedFlight, traces: Traces) -> Figure:
+    if not traces.inputs:
+        raise MissingData("the log holds fewer than two ticks of every chaser")
+    figure, (axes,) = _timed_figure(flight, 1)
+    mass_kg = flight.scenario.chaser.mass_kg
+    for i, applied in traces.inputs.items():
+        given = np.abs(applied.force_N).sum(axis=1) * np.diff(applied.edges_s)
+        total = np.concatenate([[0.0], np.cumsum(given)])
+        axes.plot(applied.edges_s, total, color=colour(i), label=f"chaser {i}")
+    axes.set(ylabel="impulse / N s", ylim=(0.0, None))
+    scale = (lambda v: v / mass_kg, lambda v: v * mass_kg)
+    right = axes.secondary_yaxis("right", functions=scale)
+    right.set_ylabel("velocity change / m s⁻¹")
+    axes.set_xlim(0.0, max(float(t.edges_s[-1]) for t in traces.inputs.values()))
+    _name_chasers(flight, axes)
+    return figure
+
+
 _DUTY = LinearSegmentedColormap.from_list(
-    "duty", [to_rgba(SERIES[0], 0.0), to_rgba(SERIES[0], 1.0)]
+    "duty", [to_rgba(AXES_XYZ[1], 0.0), to_rgba(AXES_XYZ[1], 1.0)]
 )
 """Transparent for closed valves, so that it suits light and dark pages."""
 
@@ -550,11 +743,11 @@ def thrusters(_: RecordedFlight, traces: Traces) -> Figure:
 
 
 _OUTCOME_COLOURS: dict[ImageOutcome, str] = {
-    "used": SERIES[2],
-    "rejected": SERIES[1],
-    "not seen": "#d9dce1",
+    "used": GOOD,
+    "rejected": AXES_XYZ[2],
+    "not seen": GRID,
     "bad image": LIMIT,
-    "not processed": SERIES[3],
+    "not processed": INK,
 }
 
 
@@ -611,7 +804,7 @@ def estimate(flight: RecordedFlight, _: Traces) -> Figure:
         for k, name in enumerate("xyz"):
             a = axes[3 * row + k]
             a.fill_between(time_s, -s[:, k], s[:, k], color=FAINT, alpha=0.18, linewidth=0)
-            a.plot(time_s, e[:, k], color=AXES_XYZ[k], linewidth=0.8)
+            a.plot(time_s, e[:, k], color=INK, linewidth=0.8)
             if row == 0:
                 a.set_title(name)
             if row == 3:
@@ -621,6 +814,42 @@ def estimate(flight: RecordedFlight, _: Traces) -> Figure:
         reach = 1.6 * max(float(np.max(s[settled])), float(np.max(np.abs(e[settled]))))
         axes[3 * row].set_ylim(-reach, reach)
     axes[0].set_xlim(_span_s(time_s))
+    return figure
+
+
+@_figure(
+    "Error and uncertainty of the pose relative to the target",
+    "Distance and angle between estimated and true pose of each chaser relative to the target "
+    "(solid), and the standard deviation that the estimator states for them (dashed).",
+)
+def relative_estimate(flight: RecordedFlight, _: Traces) -> Figure:
+    errors = {i: relative_errors(flight, i) for i in flight.relative}
+    errors = {i: e for i, e in errors.items() if len(e["time_s"])}
+    if not errors:
+        raise MissingData("the estimator states no relative poses, or their true motion is unknown")
+    figure, panels = _timed_figure(flight, 2)
+    for i, e in errors.items():
+        history = flight.relative[i]
+        variances = history.upper[:, [0, 6, 11, 15, 18, 20]]
+        d, known = decimated(len(e["time_s"])), decimated(len(history.time_s))
+        for axes, name, part, factor in (
+            (panels[0], "position_m", variances[:, :3], 1e3),
+            (panels[1], "orientation_rad", variances[:, 3:], np.degrees(1.0)),
+        ):
+            sigma = np.sqrt(np.maximum(part.sum(axis=1), 0.0)) * factor
+            error = np.maximum(e[name][d] * factor, 1e-4)
+            axes.semilogy(e["time_s"][d], error, color=colour(i), label=f"chaser {i}")
+            axes.semilogy(
+                history.time_s[known],
+                np.maximum(sigma[known], 1e-4),
+                color=colour(i),
+                linestyle=(0, (4, 2)),
+                linewidth=0.9,
+            )
+    _plain_numbers(panels[0].yaxis, panels[1].yaxis)
+    panels[0].set(ylabel="position / mm")
+    panels[1].set(ylabel="orientation / °", xlim=(0.0, max(flight.flown_s, 1e-3)))
+    _name_chasers(flight, panels[0])
     return figure
 
 
@@ -661,10 +890,11 @@ def consistency(flight: RecordedFlight, _: Traces) -> Figure:
     figure, (axes,) = new_figure(1)
     d = decimated(len(errors["nees"]))
     axes.semilogy(
-        errors["time_s"][d], np.maximum(errors["nees"][d], 1e-3), color=SERIES[0], linewidth=0.8
+        errors["time_s"][d], np.maximum(errors["nees"][d], 1e-3), color=INK, linewidth=0.8
     )
-    axes.axhspan(low, high, color=SERIES[2], alpha=0.15, linewidth=0)
-    axes.axhline(6.0, color=SERIES[2], linewidth=0.8)
+    axes.axhspan(low, high, color=GOOD, alpha=0.15, linewidth=0)
+    axes.axhline(6.0, color=GOOD, linewidth=0.8)
+    _plain_numbers(axes.yaxis)
     axes.set_title(consistency_text(errors["nees"], low, high))
     axes.set(ylabel="NEES", xlabel="time / s", xlim=_span_s(errors["time_s"]))
     return figure
@@ -697,8 +927,9 @@ def innovations(flight: RecordedFlight, _: Traces) -> Figure:
             )
     freedoms = np.concatenate([h.freedoms for h in flight.innovations.values()]).max()
     low, high = (float(bound) / freedoms for bound in chi_square_band(freedoms))
-    axes.axhspan(low, high, color=SERIES[2], alpha=0.15, linewidth=0)
-    axes.axhline(1.0, color=SERIES[2], linewidth=0.8)
+    axes.axhspan(low, high, color=GOOD, alpha=0.15, linewidth=0)
+    axes.axhline(1.0, color=GOOD, linewidth=0.8)
+    _plain_numbers(axes.yaxis)
     last_s = max(float(history.time_s[-1]) for history in flight.innovations.values())
     axes.set(ylabel="NIS per degree of freedom", xlabel="time / s", xlim=(0.0, max(last_s, 1e-3)))
     legend_above(axes)
@@ -756,12 +987,12 @@ def cameras(flight: RecordedFlight, traces: Traces) -> Figure:
     return figure
 
 
-def _distribution(axes: Axes, values: Array, number: int) -> None:
+def _distribution(axes: Axes, values: Array, shade: str) -> None:
     """Draw the empirical distribution function over milliseconds."""
     ordered = np.sort(values) * 1e3
     share = np.arange(1, len(ordered) + 1) / len(ordered) * 100.0
     d = decimated(len(ordered))
-    axes.plot(ordered[d], share[d], color=colour(number))
+    axes.plot(ordered[d], share[d], color=shade)
 
 
 class _FewTicks(LogLocator):
@@ -775,16 +1006,23 @@ class _FewTicks(LogLocator):
         return super().tick_values(vmin, vmax)
 
 
+def _plain_numbers(*axes: Axis) -> None:
+    """Label logarithmic axes by few numbers without exponents."""
+    for axis in axes:
+        axis.set_major_locator(_FewTicks(numticks=12))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
+
+
 def _time_and_distribution(quantity: str) -> tuple[Figure, Axes, Axes]:
     figure, (left, right) = new_figure(1, 2, height=2.6, width_ratios=[2.2, 1.0])
     left.set(ylabel=quantity, xlabel="time / s", yscale="log")
     right.set(xlabel=quantity, ylabel="cumulative share / %", ylim=(0, 101), xscale="log")
-    left.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
-    right.xaxis.set_major_locator(_FewTicks(numticks=12))
-    for axis in (left.yaxis, right.xaxis):
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
+    _plain_numbers(left.yaxis, right.xaxis)
     return figure, left, right
+
+
+_NO_WALL_TIME = "the flight was simulated in virtual time, which no computation takes"
 
 
 @_figure(
@@ -796,11 +1034,11 @@ def solver(flight: RecordedFlight, _: Traces) -> Figure:
     if not len(solves.time_s):
         raise MissingData("the log holds no solve of the controller")
     values = solves.wall_s
+    if not values.any():
+        raise MissingData(_NO_WALL_TIME)
     figure, left, right = _time_and_distribution("solve time / ms")
     d, bad = decimated(len(values)), solves.imperfect
-    left.plot(
-        solves.time_s[d], np.maximum(values[d], 1e-6) * 1e3, ".", markersize=2.2, color=SERIES[0]
-    )
+    left.plot(solves.time_s[d], np.maximum(values[d], 1e-6) * 1e3, ".", markersize=2.2, color=INK)
     if np.any(bad):
         statuses = ", ".join(sorted(set(solves.statuses) - {"solved"}))
         d = decimated(int(np.sum(bad)))
@@ -814,7 +1052,7 @@ def solver(flight: RecordedFlight, _: Traces) -> Figure:
         )
         legend_above(left)
     limit_line(left, 1e3 / flight.scenario.time.rate_hz, "tick period")
-    _distribution(right, np.maximum(values, 1e-6), 0)
+    _distribution(right, np.maximum(values, 1e-6), INK)
     p50, p95 = np.percentile(values, (50, 95)) * 1e3
     right.set_title(f"median {p50:.1f} ms, 95th percentile {p95:.1f} ms")
     return figure
@@ -829,6 +1067,8 @@ def solver(flight: RecordedFlight, _: Traces) -> Figure:
 def latency(_: RecordedFlight, traces: Traces) -> Figure:
     if not traces.latency:
         raise MissingData("no image in the log led to an actuator command")
+    if not any(rows[:, 1].any() for rows in traces.latency.values()):
+        raise MissingData(_NO_WALL_TIME)
     figure, left, right = _time_and_distribution("latency / ms")
     for i, rows in traces.latency.items():
         values = np.maximum(rows[:, 1], 1e-6)
@@ -836,7 +1076,7 @@ def latency(_: RecordedFlight, traces: Traces) -> Figure:
         left.plot(
             rows[d, 0], values[d] * 1e3, ".", markersize=2.2, color=colour(i), label=f"chaser {i}"
         )
-        _distribution(right, values, i)
+        _distribution(right, values, colour(i))
     legend_above(left)
     return figure
 

@@ -115,8 +115,8 @@ class SolverHistory:
 
 @dataclass
 class WorldHistory:
-    """Totals in the world's ground truth. ``latched``: at the end. ``contacts``: number of times
-    two bodies touched.
+    """Totals in the world's ground truth. ``latched``: at the end. ``latches``: time, s, of each
+    change, and the chasers latched from then on. ``contacts``: number of times two bodies touched.
     """
 
     ticks: int = 0
@@ -124,6 +124,7 @@ class WorldHistory:
     contacts: int = 0
     touches: list[ProbeTouch] = field(default_factory=list)
     latched: tuple[int, ...] = ()
+    latches: list[tuple[float, tuple[int, ...]]] = field(default_factory=list)
     _touching: set[Any] = field(default_factory=set)
 
     def add(self, message: WorldTruth) -> None:
@@ -133,6 +134,8 @@ class WorldHistory:
         self.contacts += len(touching - self._touching)
         self._touching = touching
         self.touches += message.touches
+        if message.latched != self.latched:
+            self.latches.append((message.sim_time_ns / 1e9, message.latched))
         self.latched = message.latched
 
 
@@ -325,6 +328,16 @@ class RecordedFlight:
         if self.world.ticks:
             return self.world.latched
         return tuple(i for i, sensed in sorted(self.sensed_docking.items()) if sensed.latched)
+
+    def latched_during(self, chaser: int, time_s: Array) -> NDArray[np.bool_]:
+        """Return whether a chaser is latched at times (K,) s."""
+        if not self.world.ticks:
+            sensed = self.sensed_docking.get(chaser, SensedDocking())
+            return (time_s >= (sensed.latch_time_s or 0.0)) & sensed.latched
+        found = np.zeros(len(time_s), dtype=np.bool_)
+        for begin_s, latched in self.world.latches:
+            found[time_s >= begin_s] = chaser in latched
+        return found
 
     @property
     def states_criteria(self) -> bool:

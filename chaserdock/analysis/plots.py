@@ -8,6 +8,7 @@ follows the theme of the page.
 
 from __future__ import annotations
 
+import base64
 import io
 import re
 from contextlib import AbstractContextManager
@@ -16,12 +17,15 @@ from typing import Any
 
 import matplotlib
 from chaserdock_protocol.output_files import replaced
+from matplotlib import get_data_path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 INK, FAINT, GRID = "#1b1e23", "#5c6370", "#d9dce1"
+GOOD = "#1b7f4b"
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a6a00", "#6b4fa0")
-AXES_XYZ = ("#d55e00", "#009e73", "#0072b2")
+AXES_XYZ = (INK, "#858d99", "#9c6b4e")
+"""Colours of x, y and z: none of a chaser."""
 LIMIT = "#b3261e"
 
 STYLE: dict[str, Any] = {
@@ -50,6 +54,8 @@ STYLE: dict[str, Any] = {
     "legend.fontsize": 8.5,
     "figure.constrained_layout.use": True,
     "svg.fonttype": "none",
+    "pdf.fonttype": 42,  # TrueType, so that text can be edited; the default is Type 3
+    "ps.fonttype": 42,
     "savefig.dpi": 150,
     "path.simplify_threshold": 0.3,
 }
@@ -59,6 +65,9 @@ _VARIABLES = {
     FAINT: "faint",
     GRID: "grid",
     LIMIT: "limit",
+    GOOD: "good",
+    AXES_XYZ[1]: "axis-y",
+    AXES_XYZ[2]: "axis-z",
     **{c: f"series-{k}" for k, c in enumerate(SERIES)},
 }
 
@@ -123,9 +132,12 @@ def limit_line(axes: Axes, value: float, label: str) -> None:
     )
 
 
-def legend_above(axes: Axes, columns: int = 8) -> None:
-    """Place the legend in one row above the right end of the axes."""
+def legend_above(axes: Axes, columns: int = 8, **entries: Any) -> None:
+    """Place the legend in one row above the right end of the axes. ``entries``: handles and labels
+    in place of those of the curves.
+    """
     axes.legend(
+        **entries,
         loc="lower right",
         bbox_to_anchor=(1.0, 1.0),
         ncols=columns,
@@ -135,11 +147,44 @@ def legend_above(axes: Axes, columns: int = 8) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure in the format of the path's suffix; equal figures give equal SVG files."""
+    """Write a figure in the format of the path's suffix; equal figures give equal SVG files. PDF
+    and SVG contain the characters that they use as TrueType.
+    """
+    is_svg = path.suffix == ".svg"
     with styled(path.stem), replaced(path) as new:
-        figure.savefig(
-            new, facecolor="white", metadata={"Date": None} if path.suffix == ".svg" else None
-        )
+        figure.savefig(new, facecolor="white", metadata={"Date": None} if is_svg else None)
+        if is_svg:
+            text = new.read_text(encoding="utf-8")
+            style = f"<style>{font_face(text)}</style>"
+            new.write_text(text.replace("</metadata>", f"</metadata>{style}", 1), encoding="utf-8")
+
+
+def font_face(text: str) -> str:
+    """Return the CSS rule that embeds the characters of a text in the font of the figures."""
+    from fontTools.subset import Options, Subsetter
+    from fontTools.ttLib import TTFont
+
+    options = Options(hinting=False, layout_features=[], notdef_outline=True)
+    options.drop_tables += ["FFTM"]  # the date of the subset
+    font = TTFont(get_data_path() + "/fonts/ttf/DejaVuSans.ttf", recalcTimestamp=False)
+    subset = Subsetter(options)
+    subset.populate(text="".join(sorted(set(text))))
+    subset.subset(font)
+    data = io.BytesIO()
+    font.save(data)
+    url = "data:font/ttf;base64," + base64.b64encode(data.getvalue()).decode()
+    return f"@font-face{{font-family:'DejaVu Sans';src:url({url})}}"
+
+
+def _rounded(attribute: re.Match[str]) -> str:
+    """Return an attribute of SVG with coordinates to 0.01 points: two thirds of the length."""
+    return re.sub(r"(\d\.\d\d)\d+", r"\1", attribute[0])
+
+
+def css_colour(hexadecimal: str) -> str:
+    """Return the page's CSS variable of a colour of the figures, or the colour itself."""
+    variable = _VARIABLES.get(hexadecimal)
+    return hexadecimal if variable is None else f"--{variable}"
 
 
 def to_inline_svg(figure: Figure, name: str, title: str) -> str:
@@ -158,6 +203,7 @@ def to_inline_svg(figure: Figure, name: str, title: str) -> str:
     # All figures of a page share one namespace of ids. SVG needs no xlink prefix.
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = text.replace("url(#", f"url(#{name}-").replace('xlink:href="#', f'href="#{name}-')
+    text = re.sub(r'\s(d|x|y|transform)="[^"]*"', _rounded, text)
     for hexadecimal, variable in _VARIABLES.items():
         text = text.replace(hexadecimal, f"var(--{variable})")
     text = re.sub(

@@ -18,6 +18,8 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.rendezvous import Arrival, ConeLimit, SpeedLimit
 
+from chaserdock.criterion import Criterion, criterion
+
 from .flight import RecordedFlight
 
 RendezvousResult = dict[str, float | None]
@@ -104,55 +106,64 @@ def _arrival(
     return {"arrived_s": float(time_s[first[0]]), "arrived_speed_m_s": float(speed[first[0]])}
 
 
-def rendezvous_failures(result: dict[str, Any], s: Scenario) -> Iterator[str]:
-    """Yield a message for each of these criteria that a summary violates."""
+def rendezvous_criteria(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
+    """Yield these criteria for each chaser of a summary."""
     for i, c in result["chasers"].items():
         if (found := c.get("rendezvous")) is not None:
-            yield from _failures(int(i), found, s)
+            yield from _of_chaser(int(i), found, s, result["sim_time_s"])
 
 
-def _failures(i: int, found: RendezvousResult, s: Scenario) -> Iterator[str]:
-    success = s.success
-    margin, angle, clear = (
-        found["speed_margin_m_s"],
-        found["cone_angle_rad"],
-        found["abort_clear_m"],
-    )
-    if success.speed_limit is not None and margin is not None and margin < 0.0:
-        yield f"chaser {i} exceeded the speed limit of success.speed_limit by {-margin:.4g} m/s"
-    cone = success.approach_cone
-    if cone is not None and angle is not None and math.degrees(angle) > cone.half_angle_deg:
-        yield (
-            f"chaser {i} was {math.degrees(angle):.4g} degrees off the axis of "
-            f"success.approach_cone within {cone.within_m:g} m; at "
-            f"most {cone.half_angle_deg:g} degrees allowed"
+def _of_chaser(i: int, found: RendezvousResult, s: Scenario, end_s: float) -> Iterator[Criterion]:
+    success, cone = s.success, s.success.approach_cone
+    margin, clear = found["speed_margin_m_s"], found["abort_clear_m"]
+    if success.speed_limit is not None:
+        value = None if margin is None else margin * 1e3
+        yield criterion(
+            "speed_limit", "below the speed limit", value, 0.0, "mm/s", i, "at least", unseen=True
         )
-    yield from _arrival_failures(i, found["arrived_s"], s)
-    if success.abort_clear_m is not None and clear is not None and clear < success.abort_clear_m:
-        yield (
-            f"chaser {i} came within a cube of half edge {clear:.4g} m about the target after its "
-            "abort; it must stay out of "
-            f"{success.abort_clear_m:g} m"
+    if cone is not None:
+        angle = _degrees(found["cone_angle_rad"])
+        note = f"within {cone.within_m:g} m of the target"
+        yield criterion(
+            "approach_cone",
+            "off the approach cone",
+            angle,
+            cone.half_angle_deg,
+            "°",
+            i,
+            note=note,
+            unseen=True,
         )
-
-
-def _arrival_failures(i: int, arrived_s: float | None, s: Scenario) -> Iterator[str]:
-    arrival = s.success.arrival
-    if arrival is None or i not in arrival.chasers:
-        return
-    allowed = "" if arrival.speed_m_s is None else f" at {arrival.speed_m_s:g} m/s or less"
-    if arrived_s is None:
-        yield f"chaser {i} did not come within {arrival.distance_m:g} m of the target{allowed}"
-    elif arrival.within_s is not None and arrived_s > arrival.within_s:
-        near = f"chaser {i} came within {arrival.distance_m:g} m of the target"
-        yield f"{near} at {arrived_s:.1f} s, at most {arrival.within_s:g} s allowed"
+    if (arrival := success.arrival) is not None and i in arrival.chasers:
+        slow = "" if arrival.speed_m_s is None else f", at {arrival.speed_m_s:g} m/s or less"
+        yield criterion(
+            "arrival",
+            "arrived at",
+            found["arrived_s"],
+            end_s if arrival.within_s is None else arrival.within_s,
+            "s",
+            i,
+            note=f"within {arrival.distance_m:g} m of the target{slow}",
+        )
+    if success.abort_clear_m is not None:
+        yield criterion(
+            "abort_clear_m",
+            "clear after abort",
+            clear,
+            success.abort_clear_m,
+            "m",
+            i,
+            "at least",
+            note="half edge of a cube about the target",
+            unseen=True,
+        )
 
 
 def rendezvous_text(found: RendezvousResult) -> str:
     """Format the values as part of a line."""
     parts = [
         ("least margin to the speed limit {:.3f} m/s", found["speed_margin_m_s"]),
-        ("at most {:.2f} deg off the cone's axis", _degrees(found["cone_angle_rad"])),
+        ("at most {:.2f}° off the cone's axis", _degrees(found["cone_angle_rad"])),
         ("arrived at {:.1f} s", found["arrived_s"]),
         ("aborted at {:.1f} s", found["abort_s"]),
         ("clear of it by {:.2f} m since", found["abort_clear_m"]),

@@ -17,9 +17,11 @@ from typing import Any
 
 from chaserdock_protocol.output_files import write_atomically
 
+from chaserdock.criterion import html_of_all, quantity
 from chaserdock.html_page import PAGE_FILES, html_page, table
 from chaserdock.verdict import verdict_of
 
+from .charts import ChartData
 from .criteria import capture_state
 from .figures import draw_figures
 from .flight import RecordedFlight, load_flight
@@ -53,27 +55,25 @@ def report_of(log: Path) -> str:
     traces = load_traces(log, flight.scenario, every)
 
     missing: list[str] = []
-    figures = []
+    figures, charts = [], ChartData()
     for kind, figure in draw_figures(flight, traces):
         if isinstance(figure, str):
             missing.append(f"{kind.title}: {figure}.")
             continue
         svg = to_inline_svg(figure, kind.name, kind.title)
+        charts.add(kind.name, figure)
         figures.append(
-            f'<h3 id="figure-{kind.name}">{escape(kind.title)}</h3>\n<figure>'
-            f"<figcaption>{escape(kind.caption)}</figcaption>\n<div "
-            f'class="wide">{svg}</div></figure>'
+            f'<h3 id="figure-{kind.name}">{escape(kind.title)}</h3>\n<figure '
+            f'id="plot-{kind.name}"><figcaption>{escape(kind.caption)}</figcaption>\n<div '
+            f'class="wide"><div class="still">{svg}</div></div>'
+            '<div class="charts" hidden></div></figure>'
         )
 
-    replay, script = "", ""
+    replay, script = "", _chart_script(charts) if charts.figures else ""
     if flight.shown:
         data = replay_data(flight, traces, small_images(log, flight))
         replay = _replay(data)
-        # "</" would end the script element.
-        text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
-        code = (PAGE_FILES / "replay.js").read_text(encoding="utf-8")
-        stored = f'<script type="application/json" id="replay-data">{text}</script>'
-        script = f"{stored}\n<script>\n{code}</script>"
+        script += _script("replay-data", data, _page_file("replay.js"))
     else:
         missing.insert(
             0,
@@ -86,7 +86,6 @@ def report_of(log: Path) -> str:
         _chasers(flight, result),
         _numbers(flight, result),
         _identified(flight),
-        _drawn(flight),
         replay,
         '<h2 id="figures">Figures</h2>',
         f'<p class="faint">Long flight: figures show one of {every} ticks; tables use all.</p>'
@@ -100,15 +99,25 @@ def report_of(log: Path) -> str:
     return html_page(f"{flight.scenario.name} {_DASH} chaserdock", body, script)
 
 
-def _quantity(value: float | None, unit: str, factor: float = 1.0, digits: int = 3) -> str:
-    if value is None:
-        return _DASH
-    scaled = value * factor
-    # "#" keeps trailing zeros; a trailing decimal point is removed. Large numbers without exponent.
-    text = (
-        f"{scaled:.0f}" if 10**digits <= abs(scaled) < 1e9 else f"{scaled:#.{digits}g}".rstrip(".")
-    )
-    return f"{text} {unit}".rstrip()
+def _page_file(name: str) -> str:
+    return (PAGE_FILES / name).read_text(encoding="utf-8")
+
+
+def _script(name: str, data: Any, code: str) -> str:
+    """Return data of this id, and the code that reads it, as elements of the page."""
+    # "</" would end the script element.
+    text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
+    stored = f'<script type="application/json" id="{name}">{text}</script>'
+    return f"{stored}\n<script>\n{code}</script>\n"
+
+
+def _chart_script(charts: ChartData) -> str:
+    """Return the charts with their library, whose licence asks for its text in every copy."""
+    library = _page_file("uPlot.iife.min.js").partition("\n")[2]  # without the address of its site
+    licence, style = _page_file("uPlot.LICENSE.txt"), _page_file("uPlot.min.css")
+    code = f"/*! uPlot 1.6.32\n{licence}*/\n{library}\n{_page_file('charts.js')}"
+    data = {"arrays": charts.arrays, "figures": charts.figures}
+    return f"<style>{style}</style>\n{_script('chart-data', data, code)}"
 
 
 def _number(value: int | None) -> str:
@@ -119,8 +128,13 @@ def _count(number: int, thing: str) -> str:
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
-def _rms(mean_square: float | None, unit: str, factor: float) -> str:
-    return _quantity(None if mean_square is None else math.sqrt(mean_square), unit, factor)
+def _rms(errors: dict[str, Any]) -> str:
+    """Return the RMS of position and orientation errors."""
+    square_m2, square_rad2 = errors["position_mse_m2"], errors["orientation_mse_rad2"]
+    if square_m2 is None or square_rad2 is None:
+        return _DASH
+    position, angle = math.sqrt(square_m2), math.sqrt(square_rad2)
+    return f"{quantity(position, 'mm', 1e3)}, {quantity(angle, '°', math.degrees(1.0))}"
 
 
 def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
@@ -136,10 +150,11 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
         where.insert(0, ("replay-section", "Replay"))
     links = "".join(f'<a href="#{anchor}">{name}</a>' for anchor, name in where)
     mode = {"lockstep": "lock-step", "realtime": "real time"}.get(result["mode"]) or "unknown mode"
+    wall = f" in {result['wall_time_s']:.1f} s" if result["wall_time_s"] else ""
     return (
         f"<h1>{escape(s.name)}</h1><p>{escape(s.description)}</p>\n<p>{verdict} "
-        f'<span class="faint">{result["sim_time_s"]:.1f} s of {s.duration_s:g} s flown in '
-        f"{result['wall_time_s']:.1f} s, {escape(mode)}; {_count(len(s.chasers), 'chaser')}; seed "
+        f'<span class="faint">{result["sim_time_s"]:.1f} s of {s.duration_s:g} s flown{wall}, '
+        f"{escape(mode)}; {_count(len(s.chasers), 'chaser')}; seed "
         f"{s.seed}; "
         f"digest {escape(result['digest'][:16])}</span></p>\n"
         f"<p>Judged against {escape(result['judged_against'])}.</p>\n<nav>{links}</nav>"
@@ -147,13 +162,13 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
 
 
 def _outcome(result: dict[str, Any]) -> str:
-    return verdict_of(result).html()
+    return verdict_of(result).html(table=True)
 
 
 def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     if not result["chasers"]:
         return "<h2>Chasers</h2><p>The log holds no chaser.</p>"
-    degree = math.degrees(1.0)
+    mass_kg = flight.scenario.chaser.mass_kg
     at_distance = any("capture" not in c for c in result["chasers"].values())
     relative = any("relative_estimate" in c for c in result["chasers"].values())
     fuel = any(c["propellant_kg"] > 0.0 for c in result["chasers"].values())
@@ -162,41 +177,43 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     rows = [
         (
             f"chaser {i}",
-            _rms(c["steady"]["position_mse_m2"], "mm", 1e3),
-            _rms(c["steady"]["orientation_mse_rad2"], "°", degree),
-            _quantity(c["position_mse_m2"], "m²"),
-            _quantity(c["orientation_mse_rad2"], "rad²"),
+            _rms(c["steady"]),
+            _rms(c),
             *([_estimated(c)] if estimated else []),
             *([_relative(c)] if relative else []),
             *([_innovations(c)] if innovations else []),
             *([_docked(c)] if at_distance else []),
-            _quantity(c["min_distance_target_m"], "m"),
-            _quantity(c["impulse_N_s"], "N s"),
-            *([_quantity(c["propellant_kg"], "g", 1e3)] if fuel else []),
+            quantity(c["min_distance_target_m"], "m"),
+            f"{quantity(c['impulse_N_s'], 'N s')}; {quantity(c['impulse_N_s'] / mass_kg, 'm/s')}",
+            *([quantity(c["propellant_kg"], "g", 1e3)] if fuel else []),
         )
         for i, c in result["chasers"].items()
     ]
     s = flight.scenario
     head = (
         "",
-        "steady position RMS",
-        "steady orientation RMS",
-        "position MSE, whole run",
-        "orientation MSE, whole run",
+        "steady RMS",
+        "RMS, whole flight",
         *(["steady RMS as estimated in flight; sightings rejected"] if estimated else []),
         *(["estimated pose relative to the target, RMS"] if relative else []),
         *(["NIS per degree of freedom; above the 95 % band"] if innovations else []),
-        *(["docked since"] if at_distance else []),
+        *(["docking pose since"] if at_distance else []),
         "minimum distance to target",
-        "impulse",
+        "impulse; velocity change",
         *(["propellant"] if fuel else []),
     )
     until = s.steady_until_s or s.duration_s
+    docked = (
+        " Docking pose since: within the tolerances of [approach] from then to the end. The phase "
+        f"docked begins {s.approach.docked_time_s:g} s later: the controller waits that long."
+        if at_distance and s.success.docked
+        else ""
+    )
     return (
         "<h2>Chasers</h2>"
         + table(head, rows)
         + '<p class="faint">Errors relative to the reference pose on the true target. '
-        + f"Steady state: {s.settling_s:g} s to {until:g} s.</p>"
+        + f"Steady state: {s.settling_s:g} s to {until:g} s.{docked}</p>"
         + _captures(result)
         + _rendezvous(result)
     )
@@ -208,7 +225,7 @@ def _relative(c: dict[str, Any]) -> str:
     if e is None:
         return _DASH
     position, angle = e["position_rms_m"], e["orientation_rms_rad"]
-    return f"{_quantity(position, 'mm', 1e3)}, {_quantity(angle, '°', math.degrees(1.0))}"
+    return f"{quantity(position, 'mm', 1e3)}, {quantity(angle, '°', math.degrees(1.0))}"
 
 
 def _innovations(c: dict[str, Any]) -> str:
@@ -216,16 +233,14 @@ def _innovations(c: dict[str, Any]) -> str:
     found = c.get("innovations")
     if found is None:
         return _DASH
-    return (
-        f"{_quantity(found['mean_per_freedom'], '')}; {_quantity(found['above_share'], '%', 1e2)}"
-    )
+    return f"{quantity(found['mean_per_freedom'], '')}; {quantity(found['above_share'], '%', 1e2)}"
 
 
 def _estimated(c: dict[str, Any]) -> str:
     """Return the tracking errors by the flight's own estimates, and its rejected sightings."""
     e, use = c["estimated_tracking"], c["sightings"]
-    position = _quantity(e["position_rms_m"], "mm", 1e3)
-    angle = _quantity(e["orientation_rms_rad"], "°", math.degrees(1.0))
+    position = quantity(e["position_rms_m"], "mm", 1e3)
+    angle = quantity(e["orientation_rms_rad"], "°", math.degrees(1.0))
     return f"{position}, {angle}; {use['rejected']} of {use['used'] + use['rejected']}"
 
 
@@ -244,11 +259,11 @@ def _captures(result: dict[str, Any]) -> str:
         (
             f"chaser {i}",
             capture_state(k),
-            _quantity(k["latch_time_s"], "s", digits=4),
-            _quantity(k["contact_lateral_m"], "mm", 1e3),
-            _quantity(k["contact_angle_rad"], "°", degree),
-            _quantity(k["contact_closing_m_s"], "mm/s", 1e3),
-            _quantity(k["contact_lateral_speed_m_s"], "mm/s", 1e3),
+            quantity(k["latch_time_s"], "s", digits=4),
+            quantity(k["contact_lateral_m"], "mm", 1e3),
+            quantity(k["contact_angle_rad"], "°", degree),
+            quantity(k["contact_closing_m_s"], "mm/s", 1e3),
+            quantity(k["contact_lateral_speed_m_s"], "mm/s", 1e3),
             str(k["probe_touches"]),
         )
         for i, c in result["chasers"].items()
@@ -279,12 +294,12 @@ def _rendezvous(result: dict[str, Any]) -> str:
     rows = [
         (
             f"chaser {i}",
-            _quantity(k["speed_margin_m_s"], "mm/s", 1e3),
-            _quantity(k["cone_angle_rad"], "°", math.degrees(1.0)),
-            _quantity(k["arrived_s"], "s", digits=5),
-            _quantity(k["arrived_speed_m_s"], "mm/s", 1e3),
-            _quantity(k["abort_s"], "s", digits=5),
-            _quantity(k["abort_clear_m"], "m"),
+            quantity(k["speed_margin_m_s"], "mm/s", 1e3),
+            quantity(k["cone_angle_rad"], "°", math.degrees(1.0)),
+            quantity(k["arrived_s"], "s", digits=5),
+            quantity(k["arrived_speed_m_s"], "mm/s", 1e3),
+            quantity(k["abort_s"], "s", digits=5),
+            quantity(k["abort_clear_m"], "m"),
         )
         for i, c in result["chasers"].items()
         if (k := c.get("rendezvous")) is not None
@@ -306,28 +321,31 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     estimate = [
         (
             "position",
-            _quantity(e["position_rms_m"], "mm", 1e3),
-            _quantity(e["max_position_error_m"], "mm", 1e3),
+            quantity(e["position_rms_m"], "mm", 1e3),
+            quantity(e["max_position_error_m"], "mm", 1e3),
         ),
         (
             "orientation",
-            _quantity(e["orientation_rms_rad"], "°", degree),
-            _quantity(e["max_orientation_error_rad"], "°", degree),
+            quantity(e["orientation_rms_rad"], "°", degree),
+            quantity(e["max_orientation_error_rad"], "°", degree),
         ),
-        ("velocity", _quantity(e["velocity_rms_m_s"], "mm/s", 1e3), ""),
-        ("rate", _quantity(e["omega_rms_rad_s"], "°/s", degree), ""),
+        ("velocity", quantity(e["velocity_rms_m_s"], "mm/s", 1e3), ""),
+        ("rate", quantity(e["omega_rms_rad_s"], "°/s", degree), ""),
     ]
     latency, solver = result["latency_s"], result["solver"]
+    timing = [
+        (f"solve time ({solver['name']}), median", quantity(solver["solve_s"]["p50"], "ms", 1e3)),
+        ("solve time, 95th percentile", quantity(solver["solve_s"]["p95"], "ms", 1e3)),
+        ("exposure to command, median", quantity(latency["p50"], "ms", 1e3)),
+        ("exposure to command, 99th percentile", quantity(latency["p99"], "ms", 1e3)),
+    ]
     against = flight.motion.describe() if TARGET in flight.motion else "nothing: no figures"
     safety = [
-        ("minimum distance between chasers", _quantity(result["min_distance_chasers_m"], "m")),
+        ("minimum distance between chasers", quantity(result["min_distance_chasers_m"], "m")),
         ("collisions", _number(result["collisions"])),
-        ("mean NEES of the estimate (6 expected)", _quantity(e["nees_mean"], "")),
-        (f"solve time ({solver['name']}), median", _quantity(solver["solve_s"]["p50"], "ms", 1e3)),
-        ("solve time, 95th percentile", _quantity(solver["solve_s"]["p95"], "ms", 1e3)),
+        ("mean NEES of the estimate (6 expected)", quantity(e["nees_mean"], "")),
         ("failed solves", str(solver["failures"])),
-        ("exposure to command, median", _quantity(latency["p50"], "ms", 1e3)),
-        ("exposure to command, 99th percentile", _quantity(latency["p99"], "ms", 1e3)),
+        *(timing if result["wall_time_s"] else ()),  # virtual time: no computation takes any
         ("late commands", _number(result["late_commands"])),
         ("messages lost", str(sum(m["lost"] for m in result["messages"].values()))),
     ]
@@ -399,14 +417,19 @@ def _drawn(flight: RecordedFlight) -> str:
         "gyro bias, deg/s",
     )
     # One column per body: with one per quantity even a wide screen would cut the table off.
-    rows = list(zip(quantities, *columns, strict=True))
+    rows = [row for row in zip(quantities, *columns, strict=True) if set(row[1:]) != {"0"}]
     head = ("", *(b.body for b in flight.drawn))
-    return f'<h2 id="drawn">True bodies and sensors</h2>{table(head, rows)}' if columns else ""
+    return (
+        '<details id="drawn"><summary>True bodies and sensors</summary>'
+        f'{table(head, rows)}<p class="faint">What is 0 for all bodies is left out.</p></details>'
+        if columns
+        else ""
+    )
 
 
 def _numbers_text(values: Iterable[float], factor: float) -> str:
     numbers = [value * factor for value in values]
-    return " ".join(f"{number:.3g}" for number in numbers) if any(numbers) else "0"
+    return ", ".join(f"{number:.3g}" for number in numbers) if any(numbers) else "0"
 
 
 def _replay(data: dict[str, Any]) -> str:
@@ -480,6 +503,8 @@ def _details(flight: RecordedFlight, result: dict[str, Any]) -> str:
     run.append(("digest", result["digest"]))
     return (
         '<h2 id="scenario">Scenario and data</h2>'
+        "<details><summary>Criteria of every chaser</summary>"
+        f"{html_of_all(verdict_of(result).criteria)}</details>{_drawn(flight)}"
         f"<details><summary>Scenario as flown</summary><pre>{escape(scenario)}</pre></details>"
         f"<details><summary>Messages</summary>{table(('topic', 'in the log', 'lost'), messages)}"
         + (f"<h3>Rejected on receipt</h3>{table(('reason', 'count'), refused)}" if refused else "")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import textwrap
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -20,25 +21,14 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_protocol.recording.log import LogError
-from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
 
+from chaserdock.criterion import COLUMNS, Criterion, text_table
 from chaserdock.verdict import estimate_doubts, verdict_of
 
 from .actuation import ImpulseTotals
 from .columns import nanoseconds, rows_since
-from .criteria import (
-    capture_failures,
-    capture_of,
-    capture_text,
-    criteria_of,
-    nearest_allowed_m,
-    not_reached,
-    overloads,
-    reached_time,
-    rest_failures,
-    stack_rest,
-)
+from .criteria import capture_of, capture_text, criteria_of, judge, reached_time, stack_rest
 from .flight import (
     InnovationHistory,
     RecordedFlight,
@@ -57,7 +47,7 @@ from .pose_errors import (
     relative_pose,
     verticals_of,
 )
-from .rendezvous import rendezvous_failures, rendezvous_of, rendezvous_text
+from .rendezvous import rendezvous_of, rendezvous_text
 
 SUMMARY_NAME = "summary.json"
 """Name of a flight's summary, beside its log."""
@@ -91,7 +81,9 @@ def summary_of_run(flight: RecordedFlight, log: Path) -> dict[str, Any]:
 
 def add_run_failure(result: dict[str, Any], failure: str) -> None:
     """Add to a summary why its launcher holds the flight for failed."""
+    row = Criterion(key="run", name="run", outcome="not met", note=failure)
     result |= {
+        "criteria": [msgspec.to_builtins(row), *result.get("criteria", ())],
         "success": False,
         "failures": [failure, *result["failures"]],
         "run_failure": failure,
@@ -389,7 +381,10 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         result["stack"] = stack
 
     judged, result["not_judged"] = criteria_of(flight)
-    result["failures"] = failures_of(result, judged)
+    stated = flight.scenario if flight.states_criteria else judged
+    rows = judge(result, stated, result["not_judged"])
+    result["criteria"] = msgspec.to_builtins(rows)
+    result["failures"] = [row.failure for row in rows if row.outcome == "not met"]
     result["success"] = not result["failures"]
     result["doubts"] = estimate_doubts(result)
     return result
@@ -497,119 +492,29 @@ def _messages(flight: RecordedFlight) -> dict[str, dict[str, int]]:
     return dict(out)
 
 
-def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
-    """Return a message for each criterion of the scenario that a summary violates."""
-    out = []
-    if result["sim_time_s"] < s.duration_s - 1.0 / s.time.rate_hz:
-        what = "the log ends" if result["ended"].startswith("not known") else "ended"
-        out.append(f"{what} at {result['sim_time_s']:.2f} s of {s.duration_s:g} s")
-    if result["collisions"]:
-        out.append(f"{result['collisions']} collisions, none allowed")
-
-    nearest = result["min_distance_chasers_m"]
-    if (
-        s.success.keep_distances
-        and nearest is not None
-        and nearest < s.limits.min_distance_chasers_m
-    ):
-        out.append(
-            f"two chasers came within {nearest:.3f} m; the limit is "
-            f"{s.limits.min_distance_chasers_m:g} m"
-        )
-
-    for i, c in result["chasers"].items():
-        if (distance := c["min_distance_target_m"]) is None:
-            continue  # without a known motion nothing of it is judged
-        limit = nearest_allowed_m(s, int(i))
-        if s.success.keep_distances and distance < limit:
-            out.append(
-                f"chaser {i} came within {distance:.3f} m of the target; the limit is {limit:g} m"
-            )
-        if int(i) in s.success.docked and not c["docked"]:
-            out.append(f"chaser {i} is not docked")
-        out += not_reached(s, int(i), c["reached_time_s"])
-        position, angle = (c["steady"][k] for k in ("position_mse_m2", "orientation_mse_rad2"))
-        what = f"chaser {i}: steady"
-        out += _exceeded(
-            f"{what} position RMS", _root(position), s.success.steady_position_rms_m, "m"
-        )
-        out += _exceeded(
-            f"{what} orientation RMS",
-            _degrees(_root(angle)),
-            s.success.steady_orientation_rms_deg,
-            "deg",
-        )
-
-    out += capture_failures(result, s)
-    out += overloads(result, s)
-    out += rest_failures(result, s)
-    out += rendezvous_failures(result, s)
-    return out + list(_estimate_failures(result, s))
-
-
-def _estimate_failures(result: dict[str, Any], s: Scenario) -> Iterator[str]:
-    """Yield a message for each estimated pose relative to the target that exceeds its limits.
-
-    An estimator that publishes none treats the odometry of the chasers as exact, and is judged by
-    the target's pose.
-    """
-    relative = {
-        f"chaser {i}: largest {{}} error of its estimated pose relative to the target": c[
-            "relative_estimate"
-        ]
-        for i, c in result["chasers"].items()
-        if "relative_estimate" in c
-    }
-    for what, estimate in (
-        relative or {"largest {} error of the estimate": result["target_estimate"]}
-    ).items():
-        position, angle = (
-            estimate["max_position_error_m"],
-            _degrees(estimate["max_orientation_error_rad"]),
-        )
-        yield from _exceeded(
-            what.format("position"), position, s.success.max_estimate_position_m, "m"
-        )
-        yield from _exceeded(
-            what.format("orientation"), angle, s.success.max_estimate_orientation_deg, "deg"
-        )
-
-
-def _root(mean_square: float | None) -> float | None:
-    return None if mean_square is None else math.sqrt(mean_square)
-
-
-def _degrees(angle_rad: float | None) -> float | None:
-    return None if angle_rad is None else math.degrees(angle_rad)
-
-
-def _exceeded(what: str, value: float | None, limit: float | None, unit: str) -> Iterator[str]:
-    """Yield a message if there is a limit and the value exceeds it or is unknown."""
-    if limit is not None and (value is None or value > limit):
-        shown = "unknown" if value is None else f"{value:.4g} {unit}"
-        yield f"{what}: {shown}, at most {limit:g} {unit} allowed"
-
-
 def text_of(result: dict[str, Any]) -> str:
-    """Format the summary as a few lines of text."""
-    factor = result["sim_time_s"] / result["wall_time_s"] if result["wall_time_s"] else 0.0
-    verdict = verdict_of(result)
+    """Format the summary as lines of text, at most ``COLUMNS`` wide: verdict, criteria, chasers."""
+    verdict, wall_s = verdict_of(result), result["wall_time_s"]
+    speed = (
+        f" in {wall_s:.1f} s ({result['sim_time_s'] / wall_s:.2f} x real time)" if wall_s else ""
+    )
     lines = [
         f"{result['scenario']}: {verdict.headline}; "
-        f"{result['sim_time_s']:.1f} s flown in "
-        f"{result['wall_time_s']:.1f} s ({factor:.2f} x real time), digest {result['digest'][:16]}"
+        f"{result['sim_time_s']:.1f} s flown{speed}, digest {result['digest'][:16]}"
     ]
+    lines += [f"  {line}" for line in verdict.lines_beside_table()]
     if result["judged_against"] != "ground truth":
         lines.append(f"  judged against {result['judged_against']}")
+    head, lines = lines, []
     for i, c in result["chasers"].items():
         lines.append(_chaser_text(i, c))
     estimate = result["target_estimate"]
     if estimate["position_rms_m"] is not None:
         lines.append(
             f"  target estimate: RMS {estimate['position_rms_m'] * 1e3:.2f} mm, "
-            f"{math.degrees(estimate['orientation_rms_rad']):.3f} deg; largest error "
+            f"{math.degrees(estimate['orientation_rms_rad']):.3f}°; largest error "
             f"{estimate['max_position_error_m'] * 1e3:.2f} mm, "
-            f"{math.degrees(estimate['max_orientation_error_rad']):.3f} deg; mean NEES "
+            f"{math.degrees(estimate['max_orientation_error_rad']):.3f}°; mean NEES "
             f"{estimate['nees_mean']:.2f} of 6"
         )
     if result["mode"] == "realtime" and result["latency_s"]["p50"] is not None:
@@ -620,8 +525,30 @@ def text_of(result: dict[str, Any]) -> str:
             f"{latency['p99'] * 1e3:.1f} ms; "
             f"{late} commands late, {result['unanswered']} missing"
         )
-    lines += [f"  {line}" for line in verdict.lines()]
-    return "\n".join(lines)
+    return "\n".join([*_wrapped(head), *text_table(verdict.criteria), *_wrapped(lines)])
+
+
+def _wrapped(lines: list[str]) -> Iterator[str]:
+    """Yield lines of at most ``COLUMNS`` characters; long words stay whole, so that a path can be
+    copied.
+    """
+    for line in lines:
+        indent = " " * (len(line) - len(line.lstrip()) + 4)
+        yield from textwrap.wrap(
+            line, COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+        )
+
+
+def print_summary(result: dict[str, Any]) -> None:
+    """Print the summary as text, in colour on a terminal: what failed, what was not judged."""
+    from rich.console import Console
+    from rich.text import Text
+
+    text = Text(text_of(result))
+    text.highlight_words(["FAILED", "not met", "not met:"], "bold red")
+    text.highlight_words(["not judged", "success, but"], "yellow")
+    text.highlight_regex(r"(?m)^  met(?= )|: success;", "green")
+    Console(soft_wrap=True, highlight=False).print(text)
 
 
 def _chaser_text(i: str, c: dict[str, Any]) -> str:
@@ -630,7 +557,7 @@ def _chaser_text(i: str, c: dict[str, Any]) -> str:
     if steady["position_mse_m2"] is not None:
         line += (
             f"steady RMS {math.sqrt(steady['position_mse_m2']) * 1e3:.2f} mm, "
-            f"{math.degrees(math.sqrt(steady['orientation_mse_rad2'])):.3f} deg; "
+            f"{math.degrees(math.sqrt(steady['orientation_mse_rad2'])):.3f}°; "
         )
     if (nearest := c["min_distance_target_m"]) is not None:
         line += f"closest to the target {nearest:.3f} m"
@@ -639,11 +566,11 @@ def _chaser_text(i: str, c: dict[str, Any]) -> str:
     if c["propellant_kg"] > 0.0:
         line += f"; propellant {c['propellant_kg'] * 1e3:.1f} g"
     if c["docked"]:
-        line += f"; docked since {c['dock_time_s']:.1f} s"
+        line += f"; in its docking pose since {c['dock_time_s']:.1f} s"
     if (relative := c.get("relative_estimate")) is not None:
         line += (
             f"; estimated relative to it within {relative['position_rms_m'] * 1e3:.2f} mm, "
-            f"{math.degrees(relative['orientation_rms_rad']):.3f} deg RMS"
+            f"{math.degrees(relative['orientation_rms_rad']):.3f}° RMS"
         )
     line += innovations_text(c.get("innovations"))
     if "capture" in c:
@@ -669,6 +596,6 @@ def _estimates_text(c: dict[str, Any]) -> str:
     if e["position_rms_m"] is not None:
         text += (
             f"estimated steady RMS {e['position_rms_m'] * 1e3:.2f} mm, "
-            f"{math.degrees(e['orientation_rms_rad']):.3f} deg; "
+            f"{math.degrees(e['orientation_rms_rad']):.3f}°; "
         )
     return f"{text}{use['rejected']} of {use['used'] + use['rejected']} sightings rejected"

@@ -77,10 +77,13 @@ def judge(
     refuse_options(
         context, ("timeout", "world_timeout", "quiet", *link_options), "only with --live"
     )
-    from chaserdock.analysis.summary import summarize, text_of
+    from chaserdock.analysis.summary import print_summary, summarize
 
     result = summarize(log)
-    print_result(as_json, result, [text_of(result)])
+    if as_json:
+        print_result(as_json, result, ())
+    else:
+        print_summary(result)
     raise typer.Exit(0 if result["success"] else 1)
 
 

@@ -542,10 +542,10 @@ def print_outcome(outcome: MissionOutcome, show: Show) -> None:
     """Print the verdict: on standard output unless that carries JSON lines; a failure on standard
     error.
     """
-    from chaserdock.analysis.summary import text_of
+    from chaserdock.analysis.summary import print_summary
 
     if outcome.summary is not None and show is not Show.json:
-        print(text_of(outcome.summary))
+        print_summary(outcome.summary)
         print(f"log, summary and output of the processes: {outcome.folder}")
     if outcome.failure is not None:
         prefix = "" if outcome.summary is None else "failed: "

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_models.arrays import Array
 
-from chaserdock.analysis.plots import SERIES
+from chaserdock.analysis.plots import AXES_XYZ, SERIES
 
 from .history import ChartQuantity, History
 
@@ -21,6 +21,8 @@ COLOURS = SERIES
 curves.
 """
 ESTIMATE_COLOUR = "#e0a800"
+QUANTITIES = (ESTIMATE_COLOUR, *AXES_XYZ[1:])
+"""Colours of curves that belong to no chaser, on a light or dark panel."""
 
 
 Curve = tuple[str, str, ChartQuantity, int | None]
@@ -48,13 +50,13 @@ def plots_of(
         return tuple((f"chaser {i}", COLOURS[i % len(COLOURS)], quantity, i) for i in numbers)
 
     estimate: tuple[Curve, ...] = (
-        ("position, mm", ESTIMATE_COLOUR, "estimate_error_mm", None),
-        ("attitude, deg", "#7c8aa0", "estimate_error_deg", None),
+        ("position, mm", QUANTITIES[0], "estimate_error_mm", None),
+        ("attitude, deg", QUANTITIES[1], "estimate_error_deg", None),
     )
     uncertainty: tuple[Curve, ...] = (
-        ("mass, %", COLOURS[0], "mass_sigma_percent", None),
-        ("centre, mm", COLOURS[1], "centre_sigma_mm", None),
-        ("inertia, %", COLOURS[2], "inertia_sigma_percent", None),
+        ("mass, %", QUANTITIES[0], "mass_sigma_percent", None),
+        ("centre, mm", QUANTITIES[1], "centre_sigma_mm", None),
+        ("inertia, %", QUANTITIES[2], "inertia_sigma_percent", None),
     )
     return (
         Plot("distance to the target, m", each("distance_m")),
@@ -63,7 +65,7 @@ def plots_of(
         *((Plot("error of the target estimate", estimate),) if truth else ()),
         *((Plot("load at the port, N", each("port_load_N", ports)),) if truth and ports else ()),
         *((Plot("identified target, 1 sigma", uncertainty),) if identified else ()),
-        Plot("solve time, ms", (("controller", COLOURS[0], "solve_ms", None),)),
+        Plot("solve time, ms", (("controller", QUANTITIES[0], "solve_ms", None),)),
         Plot("image to command, ms wall time", each("latency_ms")),
     )
 

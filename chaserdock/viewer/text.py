@@ -9,6 +9,7 @@ import re
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock.analysis.mass_properties import property_rows, true_values
+from chaserdock.criterion import markdown_table
 from chaserdock.verdict import Verdict
 
 from .history import History, Line
@@ -43,13 +44,14 @@ def head(
             lines[-1] += f", rejected: {_numbers(state.target.rejected)}"
     if verdict is not None:
         lines.append(f"{_VERDICT_MARKS[verdict.level]}**verdict: {verdict.headline}**")
-        lines += verdict.lines()
+        lines += verdict.lines_beside_table()
     elif state.ended is not None:
         lines.append(
             f"{'ended' if state.ended.complete else '⛔ ended early'}: {state.ended.reason}"
         )
         lines.append("the verdict needs the log: `chaserdock judge`")
-    return "  \n".join(lines)
+    rows = "" if verdict is None else markdown_table(verdict.criteria)
+    return "  \n".join(lines) + (f"\n\n{rows}" if rows else "")
 
 
 def _numbers(chasers: tuple[int, ...]) -> str:

@@ -113,7 +113,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_figure_draws_the_estimates_with_their_bands(log: Path, tmp_path: Path) -> None:
     figure = identification(load_flight(log), Traces({}, {}, {}))
-    top, middle, bottom = figure.axes
+    _, top, middle, bottom = figure.axes  # phases, and panels
     mass = np.asarray(top.get_lines()[0].get_ydata())
     assert mass[[0, -1]] == pytest.approx([174.0, 153.0])
     true = [line for line in top.get_lines() if line.get_linestyle() == "--"]

@@ -112,15 +112,14 @@ def limited(**limits: float) -> dict[str, Any]:
         (
             {"force_limit_N": 3.4},
             [
-                "chaser 0: largest force on its port: 3.5 N, at most 3.4 N allowed; exceeded from "
-                "0.13 s on",
+                "force on the port, chaser 0: 3.50 N, at most 3.4 N; exceeded from 0.13 s on",
             ],
         ),
         (
             {"torque_limit_N_m": 0.05},
             [
-                "chaser 0: largest torque on its port: 0.7 N m, at most 0.05 N m allowed; exceeded "
-                "from 0.13 s on",
+                "torque on the port, chaser 0: 0.700 N m, at most 0.05 N m; exceeded from "
+                "0.13 s on",
             ],
         ),
     ],
@@ -138,7 +137,7 @@ def test_limits_without_loads_in_the_log_are_not_met(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", FORCES_N, measured=False, **limited(force_limit_N=5.0))
     result = summarize(log)
     assert result["chasers"]["0"]["capture"]["port_load"] is None
-    assert "chaser 0: largest force on its port: unknown, at most 5 N allowed" in result["failures"]
+    assert "force on the port, chaser 0: not known, at most 5 N" in result["failures"]
 
 
 @pytest.mark.parametrize(
@@ -168,7 +167,7 @@ def test_limit_below_the_tumble_is_one_line(limits: dict[str, float], message: s
 
 def test_figure_draws_each_port_and_needs_a_load(tmp_path: Path) -> None:
     figure = loads(load_flight(made_log(tmp_path / "a.mcap", FORCES_N)), Traces({}, {}, {}))
-    top, bottom = figure.axes
+    _, top, bottom = figure.axes  # phases, and panels
     force, shear = top.get_lines()[:2]
     assert np.asarray(force.get_ydata()).tolist() == list(FORCES_N)
     assert np.asarray(shear.get_ydata()).tolist() == pytest.approx([0.8 * f for f in FORCES_N])

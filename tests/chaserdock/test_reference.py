@@ -207,7 +207,7 @@ def test_flight_is_not_judged_by_a_reference_that_jumped(measured: Path, tmp_pat
     (said,) = (x for x in after["not_judged"] if x.startswith("reference jumped"))
     assert said.startswith("reference jumped: chaser/1 by 0.50 m, 0 deg at 0.70")
     assert said.endswith("left out to the end")
-    assert f"not judged: {said}" in text_of(after)
+    assert said.removeprefix("reference jumped: ") in " ".join(text_of(after).split())
     own = after["chasers"]["1"]
     assert own["position_mse_m2"] < 2.0 * before["chasers"]["1"]["position_mse_m2"]
     assert after["chasers"]["0"] == before["chasers"]["0"]
@@ -366,7 +366,7 @@ def test_chaser_without_a_reference_is_named_and_the_others_are_judged(tmp_path:
     result = summarize(log)
     assert "chaser 0, criteria on its pose: the log has no reference of it" in result["not_judged"]
     assert result["chasers"]["0"]["steady"]["position_mse_m2"] is None
-    assert {line.partition(":")[0] for line in result["failures"]} == {"chaser 1"}
+    assert {line.partition(", ")[2][:8] for line in result["failures"]} == {"chaser 1"}
     assert result["chasers"]["0"]["estimated_tracking"]["position_rms_m"] > 0.1
 
 
@@ -391,7 +391,8 @@ def test_flight_without_a_reference_is_judged_by_what_needs_none(bare: Path) -> 
     assert result["collisions"] is None
     assert result["target_estimate"]["position_rms_m"] is None
     assert verdict_of(result).headline == "success, but 6 criteria not judged"
-    assert "nothing: the log has neither ground truth nor a reference" in text_of(result)
+    said = " ".join(text_of(result).split())
+    assert "nothing: the log has neither ground truth nor a reference" in said
     judged = CliRunner().invoke(app, ["judge", str(bare)])
     assert (judged.exit_code, "1.2 s flown" in judged.output) == (0, True)
 
@@ -415,7 +416,7 @@ def test_estimated_tracking_error_is_that_of_the_flight_software(bare: Path) -> 
 def test_flight_that_ends_early_fails_without_ground_truth_as_well(tmp_path: Path) -> None:
     flight = load_flight(without_truth(GOLDEN, tmp_path / "mission.mcap"))
     flight.scenario = flight.scenario.model_copy(update={"duration_s": 60.0})
-    assert "ended at 1.20 s of 60 s" in summary_of(flight)["failures"]
+    assert summary_of(flight)["failures"][0].startswith("flown: 1.20 s, at least 60 s; ")
 
 
 def test_docking_is_judged_by_its_sensor() -> None:
@@ -429,12 +430,12 @@ def test_docking_is_judged_by_its_sensor() -> None:
     assert capture["latch_time_s"] == pytest.approx(latched_s)
     assert (capture["contact_lateral_m"], capture["probe_touches"]) == (None, 1)
     assert result["success"]
-    assert f"verified, latched at {latched_s:.1f} s" in text_of(result)
+    assert f"verified, latched at {latched_s:.1f} s" in " ".join(text_of(result).split())
     # Without the latch the criterion is violated.
     flight = load_flight(CAPTURE)
     assert flight.latched == (0,)
     flight.sensed_docking[0].latched = False
-    assert "chaser 0 is not latched" in summary_of(flight)["failures"]
+    assert summary_of(flight)["failures"][0].startswith("latched and verified, chaser 0: never")
 
 
 def test_loads_on_ports_are_not_judged_without_their_ground_truth() -> None:
@@ -548,7 +549,7 @@ def replace_failures(result: dict[str, Any]) -> dict[str, Any]:
 def test_log_that_ends_early_says_that_it_does_and_not_that_the_flight_did(tmp_path: Path) -> None:
     log = cropped(GOLDEN, tmp_path / "mission.mcap", 0.0, 0.7)
     result = summarize(log)
-    assert "the log ends at 0.67 s of 1.2 s" in result["failures"]
+    assert result["failures"][0].startswith("flown: 0.67 s, at least 1.2 s; ")
     assert result["ended"] == "not known: the log ends before the mission does, at 0.67 s"
     assert CliRunner().invoke(app, ["judge", str(log)]).exit_code == 1
 

@@ -160,12 +160,13 @@
     });
 
     clock.textContent = time.toFixed(1) + " s";
+    document.dispatchEvent(new CustomEvent("replay-time", { detail: time }));
     slider.value = String(time);
     data.chasers.forEach((c, k) => {
       const [a] = place(time);
       by("replay-row-" + c.id).replaceChildren(...[
         "chaser " + c.id, at(c.phase, time) || "–", Math.hypot(...minus(poses[k].p, target.p)).toFixed(3) + " m",
-        a < c.error_mm.length ? c.error_mm[a].toPrecision(3) + " mm" : "–", at(c.outcome, time) || "–",
+        a < c.error_mm.length ? c.error_mm[a].toFixed(c.error_mm[a] < 10 ? 2 : 0) + " mm" : "–", at(c.outcome, time) || "–",
       ].map((text, n) => {
         const cell = document.createElement(n ? "td" : "th");
         cell.textContent = text;
@@ -201,6 +202,7 @@
   for (const jump of document.querySelectorAll("button[data-time]")) {
     jump.addEventListener("click", () => { time = Math.min(end, Number(jump.dataset.time)); play(false); draw(); canvas.scrollIntoView({ block: "center" }); });
   }
+  document.addEventListener("replay-seek", (e) => { time = Math.min(end, Math.max(0, e.detail)); play(false); draw(); });
   let held = null;
   canvas.addEventListener("pointerdown", (e) => { held = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
   canvas.addEventListener("pointerup", () => { held = null; });

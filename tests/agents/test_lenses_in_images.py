@@ -89,7 +89,7 @@ def test_markers_are_where_projection_says_and_poses_as_good_as_stated(camera, p
     effects = CameraEffects(camera.width_px, camera.height_px, Effects(), 11)
     perception = Perception(camera, MODEL)
     corner_errors, nees, far = [], [], []
-    for number, (position, q, light) in enumerate(views(camera, 6, *place)):
+    for number, (position, q, light) in enumerate(views(camera, 12, *place)):
         exact = renderer.render(np.zeros(3), rotations.IDENTITY, position, q, (), light)
         found = perception.estimate(effects.apply(exact, 0, number))
         assert found.solutions

@@ -110,7 +110,8 @@ static void read_markers(void) {
             for (int i = 0; i < 4; i++) surface[12 * m + 3 * i + 2] = 0.0;
     }
     NAME(read_markers)(image, height, width, camera, distorted ? &lens : NULL, &limits, surface,
-                       position, doubles(n, 0.0, 0.3), n, white, cells, skip, px, finest, found);
+                       position, doubles(n, 0.0, 0.3), n, white, cells, skip, whole(0, 4), px, finest,
+                       found);
     for (int64_t m = 0; m < n; m++) {
         CHECK(found[m] >= 0.0 && found[m] < 1.0 + 1e-9);
         if (skip[m] || !finite(finest[m])) CHECK(found[m] == 0.0);

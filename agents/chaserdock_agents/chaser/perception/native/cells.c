@@ -80,9 +80,9 @@ static double located(const Image *p, const ReadLimits *limits, double *px, cons
 /* Reads the markers that a pose shows: `surface` (6 m, 3), rotated into IRF axes: the 4 corners of
  * each of m markers, their centres and their normals; `position` of the target, m; `margin` (m): as
  * for `refine_corners`. `white` (m, cells, cells): 1 for white cells; `skip` (m): markers not to be
- * read; `reach`: as for `located`. Output: `px` (m, 4, 2), ideal; `finest` (m): width of the finer of cell and border, px, NaN
- * for a marker that does not face the camera; `found` (m): correlation with its cells, 0 for those
- * that are not read. */
+ * read; `reach`: as for `located`. Output: `px` (m, 4, 2), ideal; `finest` (m): width of the finer
+ * of cell and border, px, NaN for a marker that does not face the camera; `found` (m): correlation
+ * with its cells, 0 for those that are not read. */
 EXPORT void NAME(read_markers)(const uint8_t *image, int64_t height, int64_t width,
                                const double *camera, const Lens *lens, const ReadLimits *limits,
                                const double *surface, const double *position,

@@ -27,7 +27,7 @@ from .motion_filter import (
     actuation_of,
     commanded_over,
 )
-from .recorded import Latency, RecordedRobot, recorded_robot
+from .recorded import ResponseDelay, RecordedRobot, recorded_robot
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class _Fit:
         self._least = np.maximum(np.sqrt(own) * 0.1, floors)
         self._stated = robot.motion.noise + np.diag(floors**2)
         self._noise = Noise(self._stated, wander, 0.0)
-        self._commanded: tuple[Latency, Commanded] | None = None
+        self._commanded: tuple[ResponseDelay, Commanded] | None = None
 
     def converged(self) -> tuple[RobotParameters, Pass, Noise]:
         """Return the likeliest parameters, the last pass, and the noise."""

@@ -21,7 +21,7 @@ from chaserdock_models.rigid_body import MAX_STEP_S, free_rotation
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.scenario.bodies import Body
 
-from .recorded import Latency, MeasuredMotion, Pulses, Wrenches
+from .recorded import ResponseDelay, MeasuredMotion, Pulses, Wrenches
 
 INERTIA_ROWS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Row and column of the identified elements of the inertia tensor, in their order."""
@@ -126,7 +126,7 @@ class RobotParameters:
         return cls(gains, rest[:3], rest[3:9], rest[9:15], *late, rest[17:])
 
     @property
-    def latency(self) -> Latency:
+    def latency(self) -> ResponseDelay:
         """Return the time from command to force."""
         return latency_of(self.delay_s, self.lag_s2)
 
@@ -153,10 +153,10 @@ class Commanded:
     scattered: Array
 
 
-def latency_of(delay_s: float, lag_s2: float) -> Latency:
+def latency_of(delay_s: float, lag_s2: float) -> ResponseDelay:
     """Return the latency with this mean and this square of the time constant of its lag."""
     lag_s = math.sqrt(max(0.0, lag_s2))  # rounding may leave less
-    return Latency(delay_s - lag_s, lag_s)
+    return ResponseDelay(delay_s - lag_s, lag_s)
 
 
 def commanded_over(

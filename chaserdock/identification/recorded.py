@@ -51,7 +51,7 @@ class MeasuredMotion:
     free: BoolArray
 
 
-class Latency(NamedTuple):
+class ResponseDelay(NamedTuple):
     """Time from a command to the motion: a delay, and a first-order lag of this time constant."""
 
     delay_s: float
@@ -73,7 +73,7 @@ class Pulses:
         """Whether anything was commanded."""
         return bool(self._pulses)
 
-    def over(self, time_ns: IntArray, latencies: Sequence[Latency]) -> tuple[Array, Array]:
+    def over(self, time_ns: IntArray, latencies: Sequence[ResponseDelay]) -> tuple[Array, Array]:
         """Return impulses and their first moments (see ``Valves``) between successive times (K,),
         each (latencies, K - 1, n), if they come later by each of the delays. The lag of valves is
         part of their model.
@@ -148,7 +148,7 @@ class Wrenches:
         """Whether anything was commanded."""
         return bool(np.any(self._wrenches))
 
-    def over(self, time_ns: IntArray, latencies: Sequence[Latency]) -> tuple[Array, Array]:
+    def over(self, time_ns: IntArray, latencies: Sequence[ResponseDelay]) -> tuple[Array, Array]:
         """Return impulses and first moments of force and torque, each (latencies, K - 1, 6). See
         ``Pulses.over``.
         """

@@ -27,7 +27,7 @@ from .motion_filter import (
     actuation_of,
     commanded_over,
 )
-from .recorded import ResponseDelay, RecordedRobot, recorded_robot
+from .recorded import RecordedRobot, ResponseDelay, recorded_robot
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from chaserdock_models.rigid_body import MAX_STEP_S, free_rotation
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.scenario.bodies import Body
 
-from .recorded import ResponseDelay, MeasuredMotion, Pulses, Wrenches
+from .recorded import MeasuredMotion, Pulses, ResponseDelay, Wrenches
 
 INERTIA_ROWS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Row and column of the identified elements of the inertia tensor, in their order."""

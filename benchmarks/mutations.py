@@ -24,7 +24,7 @@ from common import ROOT, Figures, make_parser, write_json
 sys.path.insert(0, str(ROOT / "tests"))
 
 from parts.tuned_numbers import survey
-from source_changes import SOURCES, Mutant, apply, copy_checkout, read_mutants, run_python
+from source_changes import SOURCES, Mutant, apply, changed, copy_checkout, read_mutants, run_python
 
 COPIED = (
     *SOURCES,
@@ -114,13 +114,8 @@ def killer(folder: Path, mutant: Mutant, timeout_s: float) -> str:
     """Return the test that kills a mutant, "" if it survives. The sources in ``folder`` are then as
     before.
     """
-    path = folder / mutant.change.file
-    source = path.read_bytes()
-    apply([mutant.change], folder)
-    try:
+    with changed(mutant.change, folder):
         return failed(folder, mutant.tests, timeout_s)
-    finally:
-        path.write_bytes(source)
 
 
 def main() -> int:

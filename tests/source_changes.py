@@ -10,7 +10,8 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,6 +65,18 @@ def apply(changes: Sequence[Change], folder: Path, write: bool = True) -> None:
             )
         if write:
             path.write_text(source.replace(change.old, change.new), encoding="utf-8")
+
+
+@contextmanager
+def changed(change: Change, folder: Path) -> Iterator[None]:
+    """Apply a change to the sources in ``folder``, and take it back. Raises as `apply`."""
+    path = folder / change.file
+    source = path.read_bytes()
+    apply([change], folder)
+    try:
+        yield
+    finally:
+        path.write_bytes(source)
 
 
 def copy_checkout(folder: Path, names: Sequence[str]) -> None:

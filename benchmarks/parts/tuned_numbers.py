@@ -16,10 +16,8 @@ import resource
 import sys
 import tempfile
 import traceback
-import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.machinery import SourceFileLoader
 from multiprocessing import Pipe
@@ -31,7 +29,7 @@ from coverage import Coverage, CoverageData
 
 sys.path.insert(0, str(ROOT / "tests"))
 
-from source_changes import SOURCES, Change, apply
+from source_changes import SOURCES, Change, changed
 from source_tree import MODULES, is_numeric, tree_of
 
 if TYPE_CHECKING:
@@ -215,6 +213,7 @@ def fly(scenario: str, expected: Sequence[int] | None = None) -> list[int]:
     """Fly a scenario in this process and return the checksums of its messages. Raises Difference at
     the first that differs from the expected ones.
     """
+    from chaserdock.simulation.flight import fingerprint_after
     from chaserdock.simulation.mission import simulate
 
     checksums: list[int] = []
@@ -222,8 +221,7 @@ def fly(scenario: str, expected: Sequence[int] | None = None) -> list[int]:
 
     def observe(sender: str, raw: RawSample) -> None:
         nonlocal differs
-        head = zlib.crc32(f"{sender}{raw.key}{raw.sent_ns}".encode(), (checksums or [0])[-1])
-        checksums.append(zlib.crc32(raw.payload, head))
+        checksums.append(fingerprint_after((checksums or [0])[-1], sender, raw))
         k = len(checksums)
         differs |= expected is not None and checksums[-1:] != expected[k - 1 : k]
 
@@ -315,7 +313,7 @@ class FailingTests:
         tests = [test for test in tests if test not in self._failing]
         if not tests:
             return ""
-        with self._changed(change):
+        with changed(change, self._folder):
             test = self._find_failing(self._folder, tests)
         if test and test not in self._passing:
             if self._find_failing(self._folder, [test]):
@@ -323,16 +321,6 @@ class FailingTests:
                 return self.of(change, tests)
             self._passing.add(test)
         return test
-
-    @contextmanager
-    def _changed(self, change: Change) -> Iterator[None]:
-        path = self._folder / change.file
-        source = path.read_bytes()
-        apply([change], self._folder)
-        try:
-            yield
-        finally:
-            path.write_bytes(source)
 
 
 def survey(

@@ -71,9 +71,7 @@ def fly_case(
 
         def tap(sender: str, raw: RawSample) -> None:
             nonlocal fingerprint
-            fingerprint = zlib.crc32(
-                raw.payload, zlib.crc32(f"{sender}{raw.key}{raw.sent_ns}".encode(), fingerprint)
-            )
+            fingerprint = fingerprint_after(fingerprint, sender, raw)
             checks.observe(sender, raw)
 
         def over() -> bool:
@@ -91,6 +89,12 @@ def fly_case(
         means=_means(checks),
         sim_time_s=checks.view.time_s,
     )
+
+
+def fingerprint_after(fingerprint: int, sender: str, raw: RawSample) -> int:
+    """Return the digest of all messages of a flight up to ``raw``, from that of those before."""
+    head = zlib.crc32(f"{sender}{raw.key}{raw.sent_ns}".encode(), fingerprint)
+    return zlib.crc32(raw.payload, head)
 
 
 def _means(checks: FlightChecks) -> dict[tuple[Expectation, str], float]:

@@ -34,10 +34,8 @@ class RetreatActivity(Activity):
             elif cause.trigger is Trigger.ATTEMPT_FAILED and _may_try_again(chaser):
                 then = NextMove.ATTEMPT
             return replace(begun, move=self._way_out(chaser, begun.phase, now_s), then=then)
-        move, speed = (
-            self._escape(chaser, now_s) if aborts else None,
-            self._moves.speed_m_s(begun.phase),
-        )
+        move = self._escape(chaser, now_s) if aborts else None
+        speed = self._moves.speed_m_s(begun.phase)
         if move is None:
             move = self._moves.move(chaser, chaser.nominal_m, now_s, speed)
         return replace(begun, move=move)

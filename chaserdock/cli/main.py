@@ -22,6 +22,7 @@ from .analysis import judge, report, video
 from .calibrate import calibrate
 from .compare import check, compare, replay, reproduce
 from .datasets import dataset
+from .demo import demo
 from .deploy import deploy
 from .help import HELP_OPTIONS, ProgramHelp, add_command
 from .logs import log, play
@@ -41,7 +42,7 @@ stay. With Python's default, 700, collecting among them takes an eighth of a pro
 """
 
 GROUPS: dict[str, tuple[Callable[..., None], ...]] = {
-    "Fly": (run, simulate, campaign, reproduce),
+    "Fly": (demo, run, simulate, campaign, reproduce),
     "Processes": (world, gateway, chaser, controller, record, play, router, ros2),
     "Operate": (command, status, view),
     "Look at a flight": (judge, report, video, log),

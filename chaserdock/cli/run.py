@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+import webbrowser
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -75,22 +76,11 @@ def run(
     """
     from chaserdock.launch.launcher import fly_mission, print_outcome
     from chaserdock.launch.signals import stop_on_signals
-    from chaserdock.viewer.address import (
-        DEFAULT_HOST,
-        TOKEN_VARIABLE,
-        free_port,
-        page_token,
-        url_of,
-    )
 
     show = show_of(quiet, as_json)
     with errors_as_json(as_json), stop_on_signals() as stop:
         scenario = _flown(scenario, like)
-        viewer_port = None
-        if view:
-            viewer_port = free_port(DEFAULT_HOST, None)
-            os.environ[TOKEN_VARIABLE] = token = page_token()  # read by the viewer's process
-            announce_viewer(viewer_port, url_of(DEFAULT_HOST, viewer_port, token))
+        viewer_port = choose_viewer_port() if view else None
         outcome = fly_mission(
             scenario,
             out,
@@ -125,9 +115,25 @@ def _flown(scenario: str | None, like: Path | None) -> str:
     return str(path)
 
 
-def announce_viewer(port: int, url: str) -> threading.Thread:
-    """Print the address of the viewer as soon as it answers, on a thread that does not outlive the
-    program.
+def choose_viewer_port(open_page: bool = False) -> int:
+    """Return a free port for the viewer of a mission that starts now, and announce its page."""
+    from chaserdock.viewer.address import (
+        DEFAULT_HOST,
+        TOKEN_VARIABLE,
+        free_port,
+        page_token,
+        url_of,
+    )
+
+    port = free_port(DEFAULT_HOST, None)
+    os.environ[TOKEN_VARIABLE] = token = page_token()  # read by the viewer's process
+    announce_viewer(port, url_of(DEFAULT_HOST, port, token), open_page)
+    return port
+
+
+def announce_viewer(port: int, url: str, open_page: bool = False) -> threading.Thread:
+    """Print the address of the viewer as soon as it answers, and with ``open_page`` open it in a
+    browser, on a thread that does not outlive the program.
     """
     from chaserdock.launch.container import is_listening
     from chaserdock.viewer.address import DEFAULT_HOST
@@ -136,6 +142,8 @@ def announce_viewer(port: int, url: str) -> threading.Thread:
         while not is_listening(DEFAULT_HOST, port):
             time.sleep(0.1)
         print(f"the viewer is at {url}", file=sys.stderr, flush=True)
+        if open_page:
+            webbrowser.open(url)
 
     thread = threading.Thread(target=wait, name="viewer address", daemon=True)
     thread.start()

@@ -190,6 +190,23 @@ class TestsByLine:
         return sorted(found, key=self._size.__getitem__)[:MOST_TESTS]
 
 
+def tests_that_name(number: NamedNumber) -> list[str]:
+    """Return the tests that mention a number, in files that mention its module."""
+    word = re.compile(rf"\b(?:{'|'.join(map(re.escape, number.names))})\b")
+    found = []
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        source = path.read_text(encoding="utf-8")
+        if number.path.stem in source and word.search(source):
+            place = path.relative_to(ROOT)
+            found += [
+                f"{place}::{function.name}"
+                for function in functions(path)
+                if function.name.startswith("test_")
+                and word.search(ast.get_source_segment(source, function) or "")
+            ]
+    return found
+
+
 class Difference(Exception):
     """A message of a flight differs."""
 
@@ -351,7 +368,7 @@ def survey(
     tests_by_line, failing = TestsByLine(data), FailingTests(folder, find_failing)
     unnoticed = 0
     for number in left:
-        tests = tests_by_line.using(lines_with(number))
+        tests = [*tests_that_name(number), *tests_by_line.using(lines_with(number))]
         test = next(filter(None, (failing.of(change, tests) for change in number.changes)), "")
         unnoticed += not test
         print(f"{number.place}: {test or f'NOTHING, {len(tests)} tests'}", flush=True)

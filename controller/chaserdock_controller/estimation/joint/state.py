@@ -36,8 +36,6 @@ FORCE, TORQUE = slice(12, 15), slice(15, 18)
 """Disturbance on the chaser, body axes, N and N m."""
 CENTRE = slice(18, 21)
 """Offset of the chaser's centre of mass from the origin of CRF, m (CRF)."""
-MOTION = 21
-"""Number of a chaser's components that its equations of motion couple."""
 POSITION_DRIFT, ATTITUDE_DRIFT, GYRO_BIAS = slice(21, 24), slice(24, 27), slice(27, 30)
 """Errors of its odometry that do not average out: position drift, m (WRF); attitude drift, rad
 (CRF); gyro bias, rad/s (CRF).

@@ -392,7 +392,7 @@ def devices() -> None:
             ("camera", "gateway", "ros2:", 0.0),
             ("pose", "gateway", "ros2:  mavlink:", 0.0),
             ("gateway", "robot", "ros2:  px4:  mavlink:", 0.0),
-            ("gateway", "latch", "ros2:", 0.0),
+            ("gateway", "latch", "ros2:  px4:  mavlink:", 0.0),
             ("latch", "gateway", "", 0.0),
         ],
     )

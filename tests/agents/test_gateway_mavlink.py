@@ -18,8 +18,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_agents.gateway.devices import DeviceError
-from chaserdock_agents.gateway.drivers import acknowledgements, command_stream, mavlink
+from chaserdock_agents.gateway.devices import DeviceError, LatchReading
+from chaserdock_agents.gateway.drivers import (
+    acknowledgements,
+    command_stream,
+    gripper,
+    mavlink,
+)
 from device_cases import (
     Clock,
     command,
@@ -85,6 +90,13 @@ class Vehicle:
             "velocity_covariance": [math.nan] * 21,
         }
         self.link.mav.odometry_send(**{**fields, **changes})
+
+    def buttons(self, state: int) -> None:
+        self.link.mav.button_change_send(20_000, 19_950, state)
+
+    def gripper_actions(self) -> list[tuple[int, float, float]]:
+        asked = [c for c in self.of("COMMAND_LONG") if c.command == 211]
+        return [(c.target_component, c.param1, c.param2) for c in asked]
 
     def close(self) -> None:
         self._over.set()
@@ -365,7 +377,7 @@ def test_robot_that_refuses_or_is_silent_is_named(
     robot.send(command())  # nothing is sent before it is armed
     robot.stop()  # never raises
     monkeypatch.setattr(mavlink, "_GONE_S", 3.0)
-    monkeypatch.setattr(acknowledgements, "_REPLY_S", 0.1)
+    monkeypatch.setattr(acknowledgements, "REPLY_S", 0.1)
     vehicle = lab.vehicle()
     vehicle.results[400] = 1
     with pytest.raises(DeviceError, match=r"^arming: temporarily rejected$"):
@@ -398,6 +410,162 @@ def test_poses_and_robot_share_a_port(lab: Lab) -> None:
     robot.close()
     poll_one(source, vehicle.odometry)
     source.close()
+
+
+# -- latch -----------------------------------------------------------------------------------------
+
+ACCEPTED, REJECTED, DENIED, IN_PROGRESS, CANCELLED = 0, 1, 2, 5, 6
+OPEN, TOUCH, OTHERS = 0b1111, 0b1101, 0b0010
+"""States of four switches to ground: none is pressed; the second is; all but the second are."""
+
+
+def opened_gripper(lab: Lab, **options: Any) -> tuple[Any, Vehicle]:
+    """Return a latch that is open, and its vehicle."""
+    latch = open_device("latch", lab.address, {"contact": 2, "gripper": 3, "system": 2, **options})
+    vehicle = lab.vehicle(2, (ARDUPILOT, SUBMARINE))
+    wait_for(lambda: vehicle.of("HEARTBEAT"))
+    vehicle.results[211] = ACCEPTED
+    latch.command("release")
+    wait_for(latch.poll)
+    return latch, vehicle
+
+
+def test_gripper_grabs_at_the_touch_and_is_latched_when_that_is_acknowledged(lab: Lab) -> None:
+    latch = open_device("latch", lab.address, {"contact": 2, "gripper": 3, "system": 2})
+    latch.command("keep")
+    with pytest.raises(DeviceError, match="system 2 was not heard"):
+        latch.command("release")
+    assert latch.poll() is None
+    vehicle, other = lab.vehicle(2, (ARDUPILOT, SUBMARINE)), lab.vehicle(1)
+    wait_for(lambda: vehicle.of("HEARTBEAT") and other.of("HEARTBEAT"))
+    vehicle.results[211] = ACCEPTED
+    latch.command("release")
+    wait_for(lambda: latch.poll() == LatchReading(contact=False, armed=False, latched=False))
+
+    def arm_until(holds: Any) -> None:
+        wait_for(lambda: latch.command("arm") or holds(latch.poll()))
+
+    vehicle.results[211] = IN_PROGRESS
+    vehicle.buttons(OTHERS)
+    other.buttons(TOUCH)
+    time.sleep(0.1)
+    arm_until(lambda reading: reading.armed)
+    assert vehicle.gripper_actions() == [(1, 3.0, 0.0)]  # open until the probe touches
+    vehicle.buttons(TOUCH)
+    arm_until(lambda reading: reading.contact and len(vehicle.gripper_actions()) == 2)
+    vehicle.buttons(OPEN)
+    arm_until(lambda reading: not reading.contact)
+    assert latch.poll() == LatchReading(contact=False, armed=True, latched=False)
+    vehicle.link.mav.command_ack_send(400, ACCEPTED)
+    vehicle.link.mav.command_ack_send(211, ACCEPTED)
+    arm_until(lambda reading: reading.latched)
+    vehicle.results[211] = ACCEPTED
+    latch.command("release")
+    wait_for(lambda: latch.poll() == LatchReading(contact=False, armed=False, latched=False))
+    assert vehicle.gripper_actions() == [(1, 3.0, 0.0), (1, 3.0, 1.0), (1, 3.0, 0.0)]
+    assert other.gripper_actions() == []
+    latch.close()
+
+
+def test_short_touch_of_an_armed_gripper_is_not_lost_and_one_before_does_not_count(
+    lab: Lab,
+) -> None:
+    latch, vehicle = opened_gripper(lab, pressed="high")
+    for armed in (False, True):
+        latch.command("arm" if armed else "release")
+        vehicle.buttons(0b0010)
+        vehicle.buttons(0b1101)
+        wait_for(lambda: latch.poll().contact)
+        assert not latch.poll().contact
+        latch.command("arm")
+        latch.command("arm")
+        if armed:
+            wait_for(lambda: latch.poll().latched)
+        time.sleep(0.1)
+        assert [c[2] for c in vehicle.gripper_actions()] == ([0.0, 1.0] if armed else [0.0])
+    latch.close()
+
+
+def test_switch_tells_what_the_gripper_holds(lab: Lab) -> None:
+    """It has closed on nothing: the acknowledgement does not make it latched."""
+    latch, vehicle = opened_gripper(lab, latched=4)
+    vehicle.buttons(TOUCH)
+    wait_for(lambda: latch.command("arm") or len(vehicle.gripper_actions()) == 2)
+    time.sleep(0.1)
+    assert latch.poll() == LatchReading(contact=True, armed=True, latched=False)
+    vehicle.buttons(TOUCH & 0b0111)
+    wait_for(lambda: latch.poll().latched)
+    vehicle.buttons(OPEN)
+    wait_for(lambda: not latch.poll().latched)
+    latch.close()
+
+
+def test_gripper_that_refuses_is_named_once_and_asked_again(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(acknowledgements, "REPLY_S", 0.1)
+    monkeypatch.setattr(gripper, "_DONE_S", 0.3)
+    latch, vehicle = opened_gripper(lab)
+    vehicle.buttons(TOUCH)
+    wait_for(lambda: latch.poll().contact)
+    for result, said in [
+        (DENIED, "gripper 3, grab: denied"),
+        (None, "gripper 3, grab: no acknowledgement within 0.4 s"),
+        (REJECTED, "gripper 3, grab: temporarily rejected"),
+        (CANCELLED, "gripper 3, grab: no acknowledgement within 0.4 s"),
+        (IN_PROGRESS, "gripper 3, grab: in progress for over 0.3 s"),
+    ]:
+        vehicle.results.pop(211, None)
+        if result is not None:
+            vehicle.results[211] = result
+        number = len(vehicle.of("COMMAND_LONG"))
+        latch.command("arm")
+        complains(latch, said)
+        assert latch.poll() == LatchReading(contact=True, armed=True, latched=False)
+        attempts = [c.confirmation for c in vehicle.of("COMMAND_LONG")][number:]
+        assert attempts == [0] if result in (DENIED, IN_PROGRESS) else [0, 1, 2, 3]
+    vehicle.results[211] = ACCEPTED
+    latch.command("arm")
+    wait_for(lambda: latch.poll().latched)
+    latch.close()
+
+
+def test_gripper_that_is_busy_for_a_moment_grabs(lab: Lab) -> None:
+    """PX4 rejects a repeated command while its first one is under way."""
+    latch, vehicle = opened_gripper(lab)
+    vehicle.results[211] = REJECTED
+    vehicle.buttons(TOUCH)
+    wait_for(lambda: latch.command("arm") or len(vehicle.gripper_actions()) == 2)
+    vehicle.link.mav.command_ack_send(211, ACCEPTED)
+    wait_for(lambda: latch.poll().latched)
+    latch.close()
+
+
+def test_gripper_that_is_armed_before_all_else_is_not_opened(lab: Lab) -> None:
+    """It may hold the target since before a restart of the gateway."""
+    latch = open_device("latch", lab.address, {"contact": 2})
+    vehicle = lab.vehicle()
+    wait_for(lambda: vehicle.of("HEARTBEAT"))
+    vehicle.results[211] = ACCEPTED
+    latch.command("arm")
+    time.sleep(0.1)
+    assert (latch.poll(), vehicle.gripper_actions()) == (None, [])
+    vehicle.buttons(TOUCH)
+    wait_for(lambda: latch.command("arm") or latch.poll())
+    assert latch.poll() == LatchReading(contact=True, armed=True, latched=True)
+    latch.close()
+
+
+def test_gripper_of_a_silent_vehicle_is_gone(lab: Lab) -> None:
+    clock = Clock()
+    latch = open_device("latch", lab.address, {"contact": 2}, clock)
+    vehicle = lab.vehicle()
+    wait_for(lambda: latch._link._heard_ns)
+    vehicle.close()
+    lab._vehicles.clear()
+    clock.time_ns += 3_100_000_000
+    complains(latch, f"system 1 on udp://127.0.0.1:{lab.port} is silent for over 3 s")
+    latch.close()
 
 
 # -- serial ports ----------------------------------------------------------------------------------
@@ -528,6 +696,9 @@ def test_serial_port_in_use_is_named(line: SerialLine) -> None:
         ("pose", "mavlink:udp://127.0.0.1:1", {"sysid": 1}, "unknown option 'sysid'"),
         ("robot", "mavlink:udp://127.0.0.1:1", {}, "missing required field `force_max_N`"),
         ("robot", "mavlink:udp://127.0.0.1:1", {**PLANAR, "system": 0}, "in option system"),
+        ("latch", "mavlink:udp://127.0.0.1:1", {}, "missing required field `contact`"),
+        ("latch", "mavlink:udp://127.0.0.1:1", {"contact": 9}, "in option contact"),
+        ("latch", "mavlink:udp://127.0.0.1:1", {"contact": 1, "gripper": 0}, "in option gripper"),
     ],
 )
 def test_invalid_input_gives_one_line(

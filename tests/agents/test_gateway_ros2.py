@@ -694,16 +694,19 @@ class EmulatedPx4:
             for asked in self.read["VehicleCommand"][answered:]:
                 answered += 1
                 if asked.command in self.results:
-                    self._ack.publish(
-                        timestamp=1,
-                        command=asked.command,
-                        result=self.results[asked.command],
-                        result_param1=0,
-                        result_param2=0,
-                        target_system=asked.source_system,
-                        target_component=asked.source_component,
-                        from_external=False,
-                    )
+                    self.acknowledge(asked, self.results[asked.command])
+
+    def acknowledge(self, asked: Any, result: int) -> None:
+        self._ack.publish(
+            timestamp=1,
+            command=asked.command,
+            result=result,
+            result_param1=0,
+            result_param2=0,
+            target_system=asked.source_system,
+            target_component=asked.source_component,
+            from_external=False,
+        )
 
     def close(self) -> None:
         self._over.set()
@@ -790,7 +793,7 @@ def test_px4_that_refuses_or_is_silent_is_named(
     from chaserdock_agents.gateway.drivers import acknowledgements, px4_robot
 
     monkeypatch.setattr(px4_robot, "_LEAD_S", 0.0)
-    monkeypatch.setattr(acknowledgements, "_REPLY_S", 0.2)
+    monkeypatch.setattr(acknowledgements, "REPLY_S", 0.2)
     robot = open_px4(peer, **WRENCH)
     px4.results[400] = 2
     with pytest.raises(DeviceError, match=r"^PX4, arming: denied$"):
@@ -814,7 +817,7 @@ def test_px4_that_is_stopped_while_it_arms_is_not_armed(
 
     acknowledged = waits_for == "an acknowledgement"
     monkeypatch.setattr(px4_robot, "_LEAD_S", 0.0 if acknowledged else 30.0)
-    monkeypatch.setattr(acknowledgements, "_REPLY_S", 0.1)
+    monkeypatch.setattr(acknowledgements, "REPLY_S", 0.1)
     px4.results.clear()
     robot = open_px4(peer, **WRENCH)
     errors: list[str] = []
@@ -906,6 +909,66 @@ def test_latch_of_another_type_is_named(peer: Peer) -> None:
     wait_for(refused)
 
 
+def test_gripper_of_px4_grabs_at_the_touch_and_is_latched_when_that_is_acknowledged(
+    peer: Peer, px4: EmulatedPx4
+) -> None:
+    name = f"/robot{peer._number}/topic"
+    options = {**peer.options, "contact": "probe/contact", "gripper": 2, "system": 3}
+    latch = open_device("latch", f"px4:{name}", options)
+    probe = peer.publisher(f"{name}/probe/contact", BOOL)
+    px4.results[211] = 5  # in progress
+    latch.command("release")
+    wait_for(px4.commands)
+    assert latch.poll() is None
+    asked = px4.read["VehicleCommand"][0]
+    assert (asked.target_system, asked.target_component, asked.from_external) == (3, 1, True)
+    px4.acknowledge(asked, 0)
+    wait_for(lambda: latch.poll() == LatchReading(contact=False, armed=False, latched=False))
+    latch.command("arm")
+
+    def touches() -> bool:
+        probe.publish(data=True)
+        return latch.poll().contact
+
+    wait_for(touches)
+    assert px4.commands() == [(211, 2.0, 0.0)]
+    latch.command("arm")
+    wait_for(lambda: px4.commands()[1:] == [(211, 2.0, 1.0)])
+    assert latch.poll() == LatchReading(contact=True, armed=True, latched=False)
+    px4.acknowledge(asked, 0)
+    wait_for(lambda: latch.poll().latched)
+    px4.results[211] = 4
+    latch.command("release")
+    complains(latch, "PX4, gripper 2, release: failed")
+    assert latch.poll().latched
+    px4.results[211] = 0
+    latch.command("release")
+    wait_for(lambda: not latch.poll().latched)
+    probe.close()
+    complains(latch, f"nobody publishes {name}/probe/contact any more")
+    latch.close()
+    with pytest.raises(DeviceError, match="cannot send"):
+        latch.command("arm")
+
+
+def test_gripper_of_px4_is_latched_by_its_switch_if_it_has_one(
+    peer: Peer, px4: EmulatedPx4
+) -> None:
+    name = f"/robot{peer._number}/topic"
+    options = {**peer.options, "contact": "contact", "latched": "closed"}
+    latch = open_device("latch", f"px4:{name}", options)
+    contact, closed = (peer.publisher(f"{name}/{part}", BOOL) for part in ("contact", "closed"))
+    px4.results[211] = 0
+    wait_for(lambda: closed.publish(data=False) or latch.poll())
+    wait_for(lambda: contact.publish(data=True) or latch.poll().contact)
+    latch.command("arm")
+    wait_for(lambda: px4.commands() == [(211, 1.0, 1.0)])
+    time.sleep(0.1)
+    assert latch.poll() == LatchReading(contact=True, armed=True, latched=False)
+    wait_for(lambda: closed.publish(data=True) or latch.poll().latched)
+    latch.close()
+
+
 def test_devices_of_the_docs_are_valid(peer: Peer) -> None:
     page = (ROOT / "docs" / "devices.md").read_text(encoding="utf-8")
     lab = tomllib.loads(page.split("```toml\n")[1].split("```")[0])["lab"]
@@ -932,6 +995,8 @@ def test_devices_of_the_docs_are_valid(peer: Peer) -> None:
         ("camera", "ros2:/image", {"type": POSE}, "in option type"),
         ("latch", "ros2:latch", {}, "must be an absolute name of ROS 2"),
         ("latch", "ros2:/latch", {"latched": ""}, "latched and command must name a topic each"),
+        ("latch", "px4:/robot0", {}, "missing required field `contact`"),
+        ("latch", "px4:/robot0", {"contact": ""}, "option contact must name a topic"),
         ("latch", "ros2:/latch", {"state": "x"}, "unknown option 'state'; must be one of: connect"),
         ("robot", "px4:/", {}, "needs either option thrusters, or both"),
         ("robot", "px4:/", {"thrusters": [1], **WRENCH}, "needs either option thrusters, or both"),

@@ -20,10 +20,17 @@ _RESULTS = (
     "accepted", "temporarily rejected", "denied", "unsupported", "failed", "in progress",
     "cancelled",
 )  # fmt: skip
-_REPLY_S = 0.5
+REPLY_S = 0.5
 """Wait, s, for an acknowledgement: some round trips of a slow radio link."""
-_ATTEMPTS = 4
+ATTEMPTS = 4
 """Number of times that a command is sent: messages may be lost."""
+
+
+def name_of(result: int | None) -> str:
+    """Return the name of a result (MAV_RESULT), or that there is none."""
+    if result is None:
+        return f"no acknowledgement within {ATTEMPTS * REPLY_S:g} s"
+    return _RESULTS[result] if 0 <= result < len(_RESULTS) else f"result {result}"
 
 
 class Acknowledgements:
@@ -45,15 +52,12 @@ class Acknowledgements:
         """
         with self._arrived:
             self._results.pop(command, None)
-        for attempt in range(_ATTEMPTS):
+        for attempt in range(ATTEMPTS):
             send(attempt)
             with self._arrived:
-                if self._arrived.wait_for(lambda: command in self._results, _REPLY_S):
+                if self._arrived.wait_for(lambda: command in self._results, REPLY_S):
                     break
         with self._arrived:
             result = self._results.get(command)
-        if result is None:
-            raise DeviceError(f"{what}: no acknowledgement within {_ATTEMPTS * _REPLY_S:g} s")
         if result != 0:
-            name = _RESULTS[result] if 0 <= result < len(_RESULTS) else f"result {result}"
-            raise DeviceError(f"{what}: {name}")
+            raise DeviceError(f"{what}: {name_of(result)}")

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read poses from MAVLink, and command a robot by it. Needs the extra ``chaserdock[mavlink]``.
+"""Read poses from MAVLink, and command robots and grippers by it. Needs the extra
+``chaserdock[mavlink]``.
 
 Poses: ``ODOMETRY`` and ``ATT_POS_MOCAP``. Their stamps are those of the sender's clock, which the
 gateway estimates; ``TIMESYNC`` is not needed. Robots: ``MANUAL_CONTROL`` in the manual mode of
@@ -24,11 +25,13 @@ import msgspec
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import require_extra
+from chaserdock_protocol.messages import Latch
 from chaserdock_protocol.transport.network import Undo
 
-from ..devices import DeviceError, DeviceHost, PoseSample, RobotCommand
+from ..devices import DeviceError, DeviceHost, LatchReading, PoseSample, RobotCommand
 from ..options import read_options
 from .autopilot import AutopilotRobot
+from .gripper import DO_GRIPPER, Gripper
 from .pose_samples import KEPT, is_finite, stated, turned
 from .shares import Maxima, wrench_shares
 from .sharing import Shared
@@ -224,6 +227,18 @@ class MavlinkLink:
                 self._mav.send(message)
         except OSError as error:
             raise DeviceError(f"{self._address}: {error}") from None
+
+    def command(
+        self, system: int, command: int, attempt: int, param1: float, param2: float
+    ) -> None:
+        """Send ``COMMAND_LONG`` to the autopilot (component 1) of a system. Raises DeviceError if
+        it was not heard.
+        """
+        parameters = (param1, param2, *(0.0,) * 5)
+        message = self._dialect.MAVLink_command_long_message(
+            system, 1, command, attempt, *parameters
+        )
+        self.send(system, message)
 
     def check(self, system: int) -> None:
         """Raise DeviceError if a system (0: all that were heard) has become silent."""
@@ -472,12 +487,7 @@ class MavlinkRobot(AutopilotRobot):
         _LINKS.release(self._address)
 
     def _command(self, command: int, attempt: int, param1: float, param2: float) -> None:
-        unused = (0.0,) * 5
-        # Component 1 is the autopilot.
-        message = self._dialect.MAVLink_command_long_message(
-            self._options.system, 1, command, attempt, param1, param2, *unused
-        )
-        self._link.send(self._options.system, message)
+        self._link.command(self._options.system, command, attempt, param1, param2)
 
 
 def manual_mode(autopilot: int, kind: int, options: MavlinkRobotOptions) -> float:
@@ -503,3 +513,69 @@ def manual_mode(autopilot: int, kind: int, options: MavlinkRobotOptions) -> floa
 def open_robot(address: str, options: Mapping[str, Any], host: DeviceHost) -> MavlinkRobot:
     """Open a robot: ``mavlink:udp://0.0.0.0:14550``."""
     return MavlinkRobot(address, read_options(MavlinkRobotOptions, options), host)
+
+
+# -- latch -----------------------------------------------------------------------------------------
+
+_Button = Annotated[int, msgspec.Meta(ge=1, le=8)]
+
+
+class MavlinkLatchOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """Options of a gripper on MAVLink: number of the gripper; numbers of the switches in
+    ``BUTTON_CHANGE`` that tell that the probe touches (``contact``) and that the gripper holds the
+    port (``latched``; None: it does once a grab is acknowledged); level of a switch that is
+    pressed, which for a switch to ground at ArduPilot is ``low``.
+    """
+
+    contact: _Button
+    latched: _Button | None = None
+    pressed: Literal["low", "high"] = "low"
+    gripper: Annotated[int, msgspec.Meta(ge=1, le=6)] = 1
+    system: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
+
+
+class MavlinkLatch:
+    """A gripper under PX4 or ArduPilot, with a switch at the probe."""
+
+    def __init__(self, address: str, options: MavlinkLatchOptions, host: DeviceHost) -> None:
+        self._address, self._options = address, options
+        self._link = _LINKS.acquire(address, lambda: MavlinkLink(address, host.now_ns))
+        name, has_switch = f"gripper {options.gripper}", options.latched is not None
+        self._gripper = Gripper(name, self._ask, host.now_ns, has_switch)
+        self._end = self._link.listen(("BUTTON_CHANGE", "COMMAND_ACK"), self._take)
+
+    def _ask(self, action: float, attempt: int) -> None:
+        options = self._options
+        self._link.command(options.system, DO_GRIPPER, attempt, options.gripper, action)
+
+    def _take(self, message: Any, arrived_ns: int) -> None:
+        options = self._options
+        if message.get_srcSystem() != options.system:
+            return
+        if message.get_type() == "COMMAND_ACK":
+            if message.command == DO_GRIPPER:
+                self._gripper.acknowledge(message.result)
+            return
+        pressed = message.state if options.pressed == "high" else ~message.state
+        self._gripper.touch(bool(pressed >> options.contact - 1 & 1))
+        if options.latched is not None:
+            self._gripper.grip(bool(pressed >> options.latched - 1 & 1))
+
+    def poll(self) -> LatchReading | None:
+        """See `DockingLatch`."""
+        self._link.check(self._options.system)
+        return self._gripper.poll()
+
+    def command(self, latch: Latch) -> None:
+        """See `DockingLatch`."""
+        self._gripper.command(latch)
+
+    def close(self) -> None:
+        """See `DockingLatch`."""
+        self._end()
+        _LINKS.release(self._address)
+
+
+def open_latch(address: str, options: Mapping[str, Any], host: DeviceHost) -> MavlinkLatch:
+    """Open a gripper: ``mavlink:udp://0.0.0.0:14550``."""
+    return MavlinkLatch(address, read_options(MavlinkLatchOptions, options), host)

@@ -71,7 +71,7 @@ class Px4Robot(AutopilotRobot):
         self._endpoints = RosEndpoints(options)
         super().__init__(host.now_ns)
         try:
-            where = f"{namespace.rstrip('/')}/fmu"
+            where = f"{namespace}/fmu"
             self._endpoints.subscribe(
                 f"{where}/out/vehicle_command_ack", "px4_msgs/msg/VehicleCommandAck", self._take
             )
@@ -131,9 +131,22 @@ class Px4Robot(AutopilotRobot):
         self._acknowledgements.take(int(acknowledgement.command), int(acknowledgement.result))
 
     def _command(self, command: int, attempt: int, param1: float, param2: float) -> None:
-        target, source = (self._options.system, 1), (255, 1)  # component 1: the autopilot
-        fields = (0, param1, param2, 0.0, 0.0, 0.0, 0.0, 0.0, command, *target, *source)
-        self._put("VehicleCommand", *fields, attempt, True)
+        system = self._options.system
+        self._publishers["VehicleCommand"].publish(
+            vehicle_command(system, command, attempt, param1, param2)
+        )
+
+
+def vehicle_command(system: int, command: int, attempt: int, param1: float, param2: float) -> Any:
+    """Return a ``VehicleCommand`` to the autopilot of a system."""
+    target, source = (system, 1), (255, 1)  # component 1: the autopilot
+    fields = (0, param1, param2, *(0.0,) * 5, command, *target, *source, attempt, True)
+    return TYPES.types["px4_msgs/msg/VehicleCommand"](*fields)
+
+
+def px4_namespace(address: str) -> str:
+    """Return the namespace before ``/fmu`` of an address; ``/`` is none. Raises DeviceError."""
+    return absolute_name(address) if address != "/" else ""
 
 
 def _topic(kind: str) -> str:
@@ -153,4 +166,4 @@ def open_robot(address: str, options: Mapping[str, Any], host: DeviceHost) -> Px
         raise DeviceError("needs either option thrusters, or both force_max_N and torque_max_N_m")
     if len(set(read.thrusters)) != len(read.thrusters):
         raise DeviceError(f"option thrusters names a motor twice: {list(read.thrusters)}")
-    return Px4Robot(absolute_name(address) if address != "/" else "", read, host)
+    return Px4Robot(px4_namespace(address), read, host)

@@ -176,7 +176,12 @@ class ChaserMachine:
         if phase is None:
             return None
         begun = ChaserGuidance(
-            phase, now_s, before.move, attempt=before.attempt, faces=before.faces
+            phase,
+            now_s,
+            before.move,
+            attempt=before.attempt,
+            faces=before.faces,
+            slew=before.slew,
         )
         cause = Cause(trigger, now_s, place_m)
         self.state = self._activities[phase].enter(self, begun, cause)

@@ -16,7 +16,7 @@ from .docking import DockingObservation
 from .escape import RelativeState
 from .phases import Phase, Trigger
 from .pointing import SearchProgress
-from .trajectories import Motion
+from .trajectories import Motion, Slew
 
 
 class NextMove(StrEnum):
@@ -37,7 +37,8 @@ class ChaserGuidance:
     its estimated pose in TRF when the pull test began. ``faces``: the reference attitude turns with
     the offset so that the chaser faces the target. ``turns``: the body flies the calibration
     manoeuvre. ``stuck``: it is to back out, but its latch does not open.
-    ``search``: progress along the search pattern.
+    ``search``: progress along the search pattern. ``slew``: turn from where it pointed after a
+    pause to the reference attitude.
     """
 
     phase: Phase
@@ -51,6 +52,11 @@ class ChaserGuidance:
     turns: bool = False
     stuck: bool = False
     search: SearchProgress | None = None
+    slew: Slew | None = None
+
+    def over_at(self, now_s: float) -> bool:
+        """Return whether its move and its turn are complete."""
+        return self.move.over_at(now_s) and (self.slew is None or self.slew.over_at(now_s))
 
     def inside_since(self, inside: bool, now_s: float) -> float | None:
         """Return the time since which the chaser is within its tolerances, given whether it is

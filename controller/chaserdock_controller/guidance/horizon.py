@@ -184,9 +184,11 @@ class ReferenceBuilder:
         q = np.array(c.q_wxyz)
         if self._scenario.approach.face_target or state.faces:
             q = facing_attitudes(c.position_m, c.q_wxyz, offsets, self._up)
-        if not state.turns:
+        if state.turns:
+            q = rotations.multiply(q, calibration_turns(times_s - state.since_s))
+        if state.slew is None or state.slew.over_at(float(times_s[0])):
             return q
-        return rotations.multiply(q, calibration_turns(times_s - state.since_s))
+        return rotations.multiply(q, state.slew.at(times_s))
 
     def _margins_m(self, covariances: Sequence[Array]) -> Array:
         """Return the distances (N,), m, added to the keep-out for uncertain positions, the first

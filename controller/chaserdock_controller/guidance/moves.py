@@ -35,6 +35,8 @@ class MovePlanner:
                 return self.abort_m_s
             case Phase.APPROACH | Phase.DOCKED | Phase.RETREAT:
                 return self.approach_m_s
+            case Phase.INSPECT:
+                return self._scenario.inspection.speed_m_s
             case _:
                 return self.goto_m_s
 

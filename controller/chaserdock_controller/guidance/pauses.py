@@ -10,18 +10,24 @@ from __future__ import annotations
 from dataclasses import replace
 
 import msgspec
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import length
 
 from .chaser_machine import ChaserMachine
 from .chaser_state import ChaserTick
+from .horizon import ReferenceBuilder
 from .moves import MovePlanner
 from .phases import ATTACHED, Phase, Trigger
-from .trajectories import Circuit, Escape, Glide, Motion, stay
+from .trajectories import Circuit, Escape, Glide, Motion, Slew, slew, stay
 
 
-def resume_after_pause(chaser: ChaserMachine, known: ChaserTick, moves: MovePlanner) -> None:
-    """Restart the motion of a chaser if it was not led for longer than its commands live. The time
-    of its phase stands still meanwhile. Call in every tick in which its place is known, before
-    commands are executed.
+def resume_after_pause(
+    chaser: ChaserMachine, known: ChaserTick, moves: MovePlanner, references: ReferenceBuilder
+) -> None:
+    """Restart the motion of a chaser if it was not led for longer than its commands live: from
+    where it is, and from where it points. The time of its phase stands still meanwhile. Call in
+    every tick in which its pose is known, before commands are executed.
     """
     now_s, led_s = known.now_s, chaser.led_s
     chaser.led_s = now_s
@@ -36,13 +42,15 @@ def resume_after_pause(chaser: ChaserMachine, known: ChaserTick, moves: MovePlan
     chaser.state = before
     if chaser.phase in ATTACHED:
         return
-    chaser.state = replace(before, move=stay(chaser.position_m, now_s))
+    chaser.state = replace(before, move=stay(chaser.position_m, now_s), slew=None)
     reason = f"not led for {now_s - led_s:.1f} s"
     if (motion := _again(chaser, before.move, now_s, moves)) is None:
         chaser.fire(Trigger.ATTEMPT_FAILED, now_s, reason)
     else:
         chaser.state = replace(chaser.state, move=motion)
         chaser.log(f"begins its motion again where it is: {reason}")
+    turn_back = _turn_back(chaser, known, moves.speed_m_s(chaser.phase), references)
+    chaser.state = replace(chaser.state, slew=turn_back)
 
 
 def _again(chaser: ChaserMachine, move: Motion, now_s: float, moves: MovePlanner) -> Motion | None:
@@ -60,3 +68,18 @@ def _again(chaser: ChaserMachine, move: Motion, now_s: float, moves: MovePlanner
             return move if known is None else moves.escapes.escape(known, now_s)[0]
         case _:
             return moves.move(chaser, move.goal_m, now_s, moves.speed_m_s(chaser.phase))
+
+
+def _turn_back(
+    chaser: ChaserMachine, known: ChaserTick, speed_m_s: float, references: ReferenceBuilder
+) -> Slew:
+    """Return the turn of a chaser to its reference attitude. It is as fast as its line of sight in
+    a move at ``speed_m_s``: if it has faced the target, it does so within some degrees on the way.
+    """
+    assert known.own is not None
+    assert known.offset_m is not None
+    _, q_ref, _ = references.pose(chaser, known.target, known.now_s)
+    turn = rotations.log(rotations.multiply(rotations.conjugate(q_ref), known.own.q_wxyz))
+    if chaser.scenario.chaser.is_planar:
+        turn = turn * np.array([0.0, 0.0, 1.0])  # it cannot lean: that is an error of the estimate
+    return slew(turn, known.now_s, length(known.offset_m), speed_m_s)

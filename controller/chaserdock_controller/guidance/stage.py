@@ -68,7 +68,7 @@ class GuidanceStage:
         ticks = tuple(zip(fleet.chasers, known, strict=True))
         for chaser, tick in ticks:
             if estimation.known and tick.own is not None:
-                resume_after_pause(chaser, tick, fleet.moves)
+                resume_after_pause(chaser, tick, fleet.moves, self.references)
         if estimation.known:
             fleet.follow_target(now_s, known, target.status == "tracking", is_settled(target))
         else:

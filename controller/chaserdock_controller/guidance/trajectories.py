@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Smooth motions of a reference position: polynomials in time between states. Pure functions.
+"""Smooth motions of a reference pose: polynomials in time between states. Pure functions.
 
 From rest to rest: the fifth-degree polynomial of least jerk (T. Flash and N. Hogan, 1985). From a
 moving state: the same plus the polynomial that brings the present motion to rest. A single
@@ -13,6 +13,7 @@ import math
 from functools import cached_property, lru_cache
 
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_acceleration, cw_transition
 from msgspec import Struct
@@ -312,6 +313,35 @@ def circuit(
     return Circuit(
         now_s, np.asarray(from_m, dtype=float), unit / np.linalg.norm(unit), distance_m, duration_s
     )
+
+
+class Slew(Struct, frozen=True, eq=False, tag=True):
+    """A turn of the body from elsewhere to its reference attitude, from rest to rest; the angle
+    follows the polynomial of least jerk. ``turn_rad`` (3,): rotation away from the reference
+    attitude at ``start_s``, in its body axes.
+    """
+
+    start_s: float
+    turn_rad: Array
+    duration_s: float
+
+    def over_at(self, time_s: float) -> bool:
+        """Return whether the turn is complete."""
+        return time_s >= self.start_s + self.duration_s
+
+    def at(self, times_s: ArrayLike) -> Array:
+        """Return the rotations (K, 4) that are left at times (K,)."""
+        done, _, _ = _least_jerk(np.asarray(times_s, dtype=float) - self.start_s, self.duration_s)
+        return rotations.exp((1.0 - done)[:, None] * self.turn_rad)
+
+
+def slew(turn_rad: Array, now_s: float, radius_m: float, speed_m_s: float) -> Slew:
+    """Return the turn back from ``turn_rad`` (3,). Its largest rate is that of a line of sight to
+    the target from a circle of ``radius_m`` around it, flown at ``speed_m_s``.
+    """
+    angle_rad = float(np.linalg.norm(turn_rad))
+    duration_s = max(_SHORTEST_S, PEAK_SPEED * angle_rad * radius_m / speed_m_s)
+    return Slew(now_s, turn_rad, duration_s)
 
 
 Motion = Move | Glide | Escape | Circuit

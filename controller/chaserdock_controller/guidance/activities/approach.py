@@ -43,7 +43,7 @@ class ApproachActivity(Activity):
 
     def step(self, chaser: ChaserMachine, known: ChaserTick, errors: TrackingErrors) -> None:
         state, now_s, approach = chaser.state, known.now_s, chaser.scenario.approach
-        if not state.move.over_at(now_s):
+        if not state.over_at(now_s):
             return
         inside = (
             errors.position_m <= approach.docked_position_m

@@ -20,8 +20,8 @@ DO_GRIPPER = 211
 """Number of the command. Parameters: number of the gripper, action."""
 RELEASE, GRAB = 0.0, 1.0
 """Actions (GRIPPER_ACTIONS)."""
+# Results (MAV_RESULT).
 _ACCEPTED, _TEMPORARILY_REJECTED, _IN_PROGRESS, _CANCELLED = 0, 1, 5, 6
-"""Results of a command (MAV_RESULT)."""
 _DONE_S = 10.0
 """Longest time, s, from a command to the end of its action, which PX4 acknowledges after
 PD_GRIPPER_TO: several times what a gripper takes to close.

@@ -13,12 +13,10 @@ from typing import Annotated, Any
 import msgspec
 from chaserdock_protocol.messages import Latch
 
-from chaserdock_agents.ros2.types import TYPES
-
 from ..devices import DeviceError, DeviceHost, LatchReading
 from ..options import read_options
 from .gripper import DO_GRIPPER, Gripper
-from .px4_robot import command_fields, px4_namespace
+from .px4_robot import px4_namespace, vehicle_command
 from .ros2_latch import BOOL
 from .ros2_network import RosEndpoints, RosOptions, absolute_name
 
@@ -70,9 +68,9 @@ class Px4Latch:
     def _ask(self, action: float, attempt: int) -> None:
         options = self._options
         gripper = float(options.gripper)
-        fields = command_fields(options.system, DO_GRIPPER, attempt, gripper, action)
+        message = vehicle_command(options.system, DO_GRIPPER, attempt, gripper, action)
         try:
-            self._publisher.publish(TYPES.types[_COMMAND](*fields))
+            self._publisher.publish(message)
         except Exception as error:  # of a session that is closed
             raise DeviceError(f"cannot send: {error}") from error
 

@@ -132,15 +132,16 @@ class Px4Robot(AutopilotRobot):
 
     def _command(self, command: int, attempt: int, param1: float, param2: float) -> None:
         system = self._options.system
-        self._put("VehicleCommand", *command_fields(system, command, attempt, param1, param2))
+        self._publishers["VehicleCommand"].publish(
+            vehicle_command(system, command, attempt, param1, param2)
+        )
 
 
-def command_fields(
-    system: int, command: int, attempt: int, param1: float, param2: float
-) -> tuple[Any, ...]:
-    """Return the fields of a ``VehicleCommand`` to the autopilot of a system."""
+def vehicle_command(system: int, command: int, attempt: int, param1: float, param2: float) -> Any:
+    """Return a ``VehicleCommand`` to the autopilot of a system."""
     target, source = (system, 1), (255, 1)  # component 1: the autopilot
-    return (0, param1, param2, *(0.0,) * 5, command, *target, *source, attempt, True)
+    fields = (0, param1, param2, *(0.0,) * 5, command, *target, *source, attempt, True)
+    return TYPES.types["px4_msgs/msg/VehicleCommand"](*fields)
 
 
 def px4_namespace(address: str) -> str:

@@ -112,7 +112,6 @@ OPTIONAL = {
         "chaserdock.logs.rosbag",
         "chaserdock_agents.gateway.cameras.image_messages",
         "chaserdock_agents.gateway.drivers.px4_robot",
-        "chaserdock_agents.gateway.drivers.px4_latch",
         "chaserdock_agents.gateway.drivers.ros2_network",
         "chaserdock_agents.gateway.drivers.ros2_robot",
     },

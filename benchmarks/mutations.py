@@ -29,12 +29,14 @@ from source_changes import SOURCES, Mutant, apply, changed, copy_checkout, read_
 COPIED = (
     *SOURCES,
     "benchmarks",
+    "docs",
     "examples",
     "release",
     "scenarios",
     "tests",
     "pyproject.toml",
     "CITATION.cff",
+    "README.md",
     "uv.lock",
 )
 
@@ -92,8 +94,9 @@ def failing(folder: Path, tests: Sequence[str], timeout_s: float) -> str:
     names = re.findall(r"^(?:FAILED|ERROR) (\S+::.*?)(?: - |$)", done.stdout, re.MULTILINE)
     if names:
         return names[0]
-    if done.returncode == 2:
-        return tests[0]  # its modules cannot be imported
+    lost = re.findall(r"no collectors for .*?/(tests/\S+)", done.stdout + done.stderr)
+    if lost or done.returncode == 2:
+        return [*lost, *tests][0]  # its modules cannot be imported
     raise RuntimeError(f"pytest: status {done.returncode}\n{done.stdout}{done.stderr}")
 
 

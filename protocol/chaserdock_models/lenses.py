@@ -35,8 +35,6 @@ COEFFICIENTS: dict[LensModel, tuple[int, ...]] = {
     "equidistant": (4,),
 }
 """Numbers of coefficients that a model may have."""
-NATIVE_NUMBERS = 25
-"""Length of `Lens.native`."""
 _FIXED_POINT_ROUNDS, _NEWTON_ROUNDS = 25, 12
 """Most rounds: usual lenses take 5 to 20, and 3."""
 _STEEPEST_RAD = math.radians(89.9)

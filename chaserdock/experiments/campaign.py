@@ -40,9 +40,10 @@ def fly_campaign(file: Path, out: Path | None, workers: Workers, only: int | Non
     ExperimentError when the campaign cannot continue.
     """
     plan = load_campaign(file)
-    folder = (out or Path("campaigns") / plan.name).absolute()
+    shown = out or Path("campaigns") / plan.name
+    folder = shown.absolute()
     if only is not None:
-        return _fly_one(plan, folder, only)
+        return _fly_one(plan, shown, only)
     with (
         errors_of_writing(folder, ExperimentError),
         stop_on_signals("stopping after the active runs") as stop,
@@ -59,7 +60,7 @@ def fly_campaign(file: Path, out: Path | None, workers: Workers, only: int | Non
     verdict = "; ".join([f"{plan.name}: {rate(rows)}", *qualification(rows)])
     say = repeat_command(campaign_command(file, out), _most_telling(rows))
     print("\n".join(wrapped([verdict])))
-    print(labelled(f"report, with {TABLE} beside it", (folder / PAGE).as_uri()))
+    print(labelled(f"report, with {TABLE} beside it", str(shown / PAGE)))
     print(labelled(f"a run again{with_log(plan)}", say))
     if remaining := len(plan.flights) - len(rows):
         print(
@@ -79,17 +80,19 @@ def _most_telling(rows: list[ResultRow]) -> int:
     return int(next(failed, next(doubtful, rows[0]))["index"])
 
 
-def _fly_one(plan: ExperimentPlan, folder: Path, only: int) -> int:
+def _fly_one(plan: ExperimentPlan, shown: Path, only: int) -> int:
     if not 0 <= only < len(plan.flights):
         raise ExperimentError(f"--only {only}: the runs are 0 to {len(plan.flights) - 1}")
     flight = plan.flights[only]
-    outcome = fly(flight, "all", folder / SINGLE_RUNS)
+    outcome = fly(flight, "all", shown.absolute() / SINGLE_RUNS)
     verdict = verdict_of_flight(outcome)
     head = f"{flight.label} ({flight.name}): {verdict.headline}"
     print("\n".join(wrapped([head, *(f"  {line}" for line in verdict.lines())])))
     log = Path(outcome.log or "")
     if log.is_absolute():
-        print(labelled("report, with its log beside it", write_report(log).as_uri()))
+        write_report(log)
+        page = shown / SINGLE_RUNS / flight.name / PAGE
+        print(labelled("report, with its log beside it", str(page)))
     else:
         print(outcome.log or ("no log: the controller flew alone" if flight.module else "no log"))
     if command := run_command(flight):

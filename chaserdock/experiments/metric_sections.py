@@ -77,7 +77,7 @@ def _quantiles(found: list[Metric]) -> list[PageSection]:
     for m in found:
         if len(set(values := m.values)) > 1:
             cells = (_cell(m, values, share) for share in QUANTILES)
-            body.append((m.name, str(len(values)), *cells))
+            body.append((m.name, *cells, str(len(values))))
     if not body:
         return []
     names = ("median" if share == 0.5 else f"{100 * share:.0f} %" for share in QUANTILES)
@@ -86,7 +86,7 @@ def _quantiles(found: list[Metric]) -> list[PageSection]:
         f"{100 * CONFIDENCE:.0f} % confidence interval by order statistics (binomial "
         "distribution of ranks), open on a side on which there are too few runs."
     )
-    return [PageSection("Quantiles", (Table(("metric", "runs", *names), tuple(body)), method))]
+    return [PageSection("Quantiles", (Table(("metric", *names, "runs"), tuple(body)), method))]
 
 
 def _cell(m: Metric, values: list[float], share: float) -> str:
@@ -163,7 +163,7 @@ def _figure(m: Metric, finite: list[float]) -> Figure:
             axes.plot(x, expected, color=SERIES[1], label="chi-square")
             axes.legend(loc="upper right", bbox_to_anchor=(1.0, 0.8))
             highest = max(highest, float(expected.max()))
-        axes.set_ylim(0.0, 1.3 * highest)
+        axes.set_ylim(0.0, 1.4 * highest)  # above the bars: names of quantiles, then of limits
         for share in QUANTILES:
             if math.isfinite(value := quantile(m.values, share)):
                 _mark(axes, value, share)
@@ -179,11 +179,11 @@ def _mark(axes: Axes, value: float, share: float) -> None:
     median = share == 0.5
     colour = INK if median else FAINT
     axes.axvline(
-        value, 0.0, 0.76 if median else 0.87, color=colour, linestyle="-" if median else ":"
+        value, 0.0, 0.68 if median else 0.78, color=colour, linestyle="-" if median else ":"
     )
     axes.annotate(
         "median" if median else f"{100 * share:.0f} %",
-        (value, 0.78 if median else 0.89),
+        (value, 0.70 if median else 0.80),
         xycoords=("data", "axes fraction"),
         ha="center",
         fontsize=8,

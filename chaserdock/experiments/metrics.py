@@ -16,8 +16,8 @@ from .worker import FlightOutcome
 
 CONFIDENCE = 0.95
 """Confidence of all intervals of a campaign."""
-QUANTILES = (0.05, 0.5, 0.95)
-"""Shares of the runs whose quantiles are shown: a low one, the median, a high one."""
+QUANTILES = (0.5, 0.05, 0.95)
+"""Shares of the runs whose quantiles are shown: the median, which a phone shows, low and high."""
 POSE_FREEDOMS = 6
 """Degrees of freedom of a pose, which are the expectation of its NEES."""
 _NEES = "mean NEES"

@@ -14,11 +14,11 @@ from typing import Literal
 
 from msgspec import Struct
 
+from .terminal import COLUMNS
+
 Outcome = Literal["met", "not met", "not judged"]
 LEVELS: dict[Outcome, str] = {"met": "good", "not met": "bad", "not judged": "partial"}
 """Levels of a verdict, by which pages colour an outcome."""
-COLUMNS = 80
-"""Largest width of a line in the terminal, characters."""
 _DASH = "–"  # noqa: RUF001
 
 
@@ -158,17 +158,21 @@ def table_rows(criteria: Sequence[Criterion]) -> list[TableRow]:
 
 
 def text_table(criteria: Sequence[Criterion]) -> list[str]:
-    """Return the table as lines of at most ``COLUMNS`` characters."""
+    """Return the table as lines of at most ``COLUMNS`` characters, without margins if these do not
+    fit.
+    """
     rows = table_rows(criteria)
     shown = [(r.criterion.outcome, r.criterion.name, r.who, *r.criterion.cells) for r in rows]
     grid = [("", "criterion", "chaser", "measured", "limit", "margin"), *shown]
     widths = [max(len(row[k]) for row in grid) for k in range(6)]
     gap = "  " if sum(widths) + 2 + 2 * 5 <= COLUMNS else " "
+    if sum(widths) + 2 + 5 > COLUMNS:
+        widths = widths[:-1]
     lines: list[str] = []
     for k, row in enumerate(grid):
         cells = (
             cell.ljust(width) if n < 3 else cell.rjust(width)
-            for n, (cell, width) in enumerate(zip(row, widths, strict=True))
+            for n, (cell, width) in enumerate(zip(row, widths, strict=False))
         )
         lines.append("  " + gap.join(cells).rstrip())
         if k and (note := rows[k - 1].criterion.note):

@@ -60,6 +60,17 @@ process = "chaser/2"
 peer = "controller"
 """
 
+CAMPAIGN = """name = "docs-campaign"
+scenario = "single"
+seeds = 24
+[set]
+duration_s = 30.0
+settling_s = 15.0
+"perception.name" = "statistical"
+"truth.preset" = "mismatch"
+"success.steady_position_rms_m" = 0.0035
+"""
+
 logs = ROOT / "runs" / "images"
 
 
@@ -802,7 +813,7 @@ def dataset() -> None:
 
 
 def write(name: str, image: np.ndarray) -> None:
-    """Write grey levels as docs/images/NAME.webp."""
+    """Write grey levels, or colours (BGR), as docs/images/NAME.webp."""
     cv2.imwrite(str(IMAGES / f"{name}.webp"), image, [cv2.IMWRITE_WEBP_QUALITY, 80])
 
 
@@ -823,6 +834,30 @@ def report() -> None:
             tile[y : y + small.shape[0], x : x + small.shape[1]] = small
             tiles.append(tile)
     write("report", np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])]))
+
+
+def campaign() -> None:
+    """The upper part of the report of a campaign, in a browser."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    from browser import chromium
+
+    logs.mkdir(parents=True, exist_ok=True)
+    file, out = logs / "docs-campaign.toml", logs / "docs-campaign"
+    file.write_text(CAMPAIGN, encoding="utf-8")
+    chaserdock("campaign", str(file), "--out", str(out), "--keep-logs", "none")
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 960, "height": 1200})
+        page.goto((out / "report.html").as_uri())
+        title = page.locator("h2", has_text="Outcomes by cause").bounding_box()
+        end = page.locator("figure").nth(3).bounding_box()
+        assert title is not None
+        assert end is not None
+        height = end["y"] + end["height"] - title["y"]
+        shot = page.screenshot(
+            full_page=True, clip={"x": 0.0, "y": title["y"], "width": 960.0, "height": height}
+        )
+    image = cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_COLOR)
+    write("campaign", np.asarray(image))
 
 
 # -- terminals -------------------------------------------------------------------------------------
@@ -867,6 +902,7 @@ PICTURES: dict[str, Callable[[], None]] = {
     "docking": docking, "faults": faults, "steady": steady,
     "results": results, "thrusters": thrusters,
     "targets": targets, "track": tracked, "dataset": dataset, "report": report,
+    "campaign": campaign,
     "terminal": first_flight, "status": log_info,
 }  # fmt: skip
 

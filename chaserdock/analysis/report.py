@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from chaserdock.verdict import verdict_of
 
 from .charts import ChartData
 from .criteria import capture_state
-from .figures import draw_figures
+from .figures import FIGURES, draw_figures
 from .flight import RecordedFlight, load_flight
 from .mass_properties import PRIOR_ONLY, property_rows, true_values
 from .motion import TARGET
@@ -35,28 +35,44 @@ from .time_series import load_traces
 _DASH = "–"  # noqa: RUF001
 
 
-def write_report(log: Path, out: Path | None = None) -> Path:
+ReportProgress = Callable[[str, int, int], None]
+"""Receives what is done next, the number of steps that are done, and that of all."""
+_READ = ("reading the log", "reading time series")
+
+
+def write_report(
+    log: Path, out: Path | None = None, progress: ReportProgress = lambda *_: None
+) -> Path:
     """Write the report of a log (or run folder), by default ``report.html`` beside the log; return
-    its path.
+    its path. ``progress``: called before each step.
 
     Raise LogError for an unreadable log and ChaserdockError for a path that is not writable.
     """
     out = out or (log if log.is_dir() else log.parent) / "report.html"
-    text = report_of(log)
+    text = report_of(log, progress)
     write_atomically(out, text)
     return out
 
 
-def report_of(log: Path) -> str:
+def report_of(log: Path, progress: ReportProgress = lambda *_: None) -> str:
     """Return the report as HTML. Raise LogError for an unreadable log."""
+    steps = [*_READ, *(f"figure: {kind.title}" for kind in FIGURES), "replay and images"]
+
+    def begin(step: int) -> None:
+        progress(steps[step], step, len(steps))
+
+    begin(0)
     flight = load_flight(log)
     result = summary_of_run(flight, log)
+    begin(1)
     every = decimation(flight.ticks)
     traces = load_traces(log, flight.scenario, every)
 
     missing: list[str] = []
     figures, charts = [], ChartData()
-    for kind, figure in draw_figures(flight, traces):
+    begin(len(_READ))
+    for number, (kind, figure) in enumerate(draw_figures(flight, traces), len(_READ) + 1):
+        begin(number)
         if isinstance(figure, str):
             missing.append(f"{kind.title}: {figure}.")
             continue

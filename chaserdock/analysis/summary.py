@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import textwrap
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -23,7 +22,8 @@ from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_protocol.recording.log import LogError
 from numpy.typing import NDArray
 
-from chaserdock.criterion import COLUMNS, Criterion, text_table
+from chaserdock.criterion import Criterion, text_table
+from chaserdock.terminal import wrapped
 from chaserdock.verdict import estimate_doubts, verdict_of
 
 from .actuation import ImpulseTotals
@@ -493,7 +493,7 @@ def _messages(flight: RecordedFlight) -> dict[str, dict[str, int]]:
 
 
 def text_of(result: dict[str, Any]) -> str:
-    """Format the summary as lines of text, at most ``COLUMNS`` wide: verdict, criteria, chasers."""
+    """Format the summary as lines of text that fit a terminal: verdict, criteria, chasers."""
     verdict, wall_s = verdict_of(result), result["wall_time_s"]
     speed = (
         f" in {wall_s:.1f} s ({result['sim_time_s'] / wall_s:.2f} x real time)" if wall_s else ""
@@ -525,18 +525,7 @@ def text_of(result: dict[str, Any]) -> str:
             f"{latency['p99'] * 1e3:.1f} ms; "
             f"{late} commands late, {result['unanswered']} missing"
         )
-    return "\n".join([*_wrapped(head), *text_table(verdict.criteria), *_wrapped(lines)])
-
-
-def _wrapped(lines: list[str]) -> Iterator[str]:
-    """Yield lines of at most ``COLUMNS`` characters; long words stay whole, so that a path can be
-    copied.
-    """
-    for line in lines:
-        indent = " " * (len(line) - len(line.lstrip()) + 4)
-        yield from textwrap.wrap(
-            line, COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
-        )
+    return "\n".join([*wrapped(head), *text_table(verdict.criteria), *wrapped(lines)])
 
 
 def print_summary(result: dict[str, Any]) -> None:

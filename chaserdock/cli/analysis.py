@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from chaserdock.terminal import labelled
 
 from .options import (
     FromOpt,
@@ -128,9 +131,7 @@ def report(
     if at is None:
         refuse_options(context, ("width",), "only with --at")
     if not figures and at is None:
-        from chaserdock.analysis.report import write_report
-
-        print(write_report(log, out))
+        _write_report(log, out)
         return
     if figures and at is not None:
         raise fail("--figures and --at exclude each other")
@@ -140,6 +141,28 @@ def report(
         _draw_figures(log, out, format.value)
     else:
         _draw_cameras(log, out, at, width)
+
+
+def _write_report(log: Path, out: Path | None) -> None:
+    """Write the page; show progress and its address on standard error, its path on standard
+    output.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+    from chaserdock.analysis.report import write_report
+
+    console = Console(stderr=True)
+    columns = (BarColumn(20), TaskProgressColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("")
+
+        def show(step: str, done: int, steps: int) -> None:
+            bar.update(task, description=step, completed=done, total=steps)
+
+        page = write_report(log, out, show)
+    print(page, flush=True)
+    print(labelled("to open it", page.absolute().as_uri()), file=sys.stderr)
 
 
 def _draw_figures(log: Path, out: Path, format: str) -> None:

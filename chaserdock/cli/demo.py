@@ -8,6 +8,8 @@ import sys
 
 import typer
 
+from chaserdock.terminal import labelled
+
 from .options import OutOpt
 from .run import choose_viewer_port
 
@@ -54,12 +56,11 @@ def demo(out: OutOpt = None) -> None:
         )
     print_outcome(outcome, Show.text)
     if outcome.summary is not None and not stop.is_set():
-        print("\nreport: ", end="", flush=True)
-        print(write_report(outcome.folder))
-        print("film: ", end="", flush=True)
-        film = outcome.folder / FILM
+        page, film = write_report(outcome.folder), outcome.folder / FILM
+        print(labelled("\nreport", page.absolute().as_uri()), flush=True)
         write_video(outcome.folder, film, width_px=FILM_SIZE_PX[0], height_px=FILM_SIZE_PX[1])
-        print(f"{film}\n\n{NEXT.format(folder=outcome.folder)}", end="")
+        print(labelled("film", film.absolute().as_uri()))
+        print(f"\n{NEXT.format(folder=outcome.folder)}", end="")
     raise typer.Exit(outcome.status)
 
 

@@ -74,7 +74,8 @@ def run(
     """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the
     flight is a success.
     """
-    from chaserdock.launch.launcher import fly_mission, print_outcome
+    from chaserdock.launch.launcher import fly_mission, print_outcome, print_where
+    from chaserdock.launch.progress import Show
     from chaserdock.launch.signals import stop_on_signals
 
     show = show_of(quiet, as_json)
@@ -96,6 +97,8 @@ def run(
             namespace=namespace,
         )
     print_outcome(outcome, show)
+    if outcome.summary is not None and show is not Show.json:
+        print_where(outcome)
     raise typer.Exit(outcome.status)
 
 

@@ -11,6 +11,7 @@ import typer
 from chaserdock_protocol.errors import ChaserdockError
 
 from chaserdock.exit_codes import BAD_INPUT
+from chaserdock.terminal import wrapped
 from chaserdock.toml_text import toml_document
 
 from .options import JsonOpt, SetOpt, complete_scenario, fail, refuse_options
@@ -145,6 +146,7 @@ def _only(names: list[str]) -> str:
 def _list_shipped(as_json: bool) -> None:
     """List the shipped scenarios with their duration and number of chasers."""
     import json
+    import shutil
 
     from chaserdock_protocol.scenario import load_scenario
     from chaserdock_protocol.shipped_scenarios import shipped_names, shipped_scenario
@@ -163,9 +165,16 @@ def _list_shipped(as_json: bool) -> None:
         print(json.dumps(rows, indent=2))
         return
     width = max(len(s.name) for s in scenarios)
-    print(f"{'name':{width}}  chasers  duration  description")
-    for s in scenarios:
-        print(f"{s.name:{width}}  {len(s.chasers):7}  {s.duration_s:6.0f} s  {s.description}")
+    head = [f"{'name':{width}}  chasers  duration"]
+    head += [f"{s.name:{width}}  {len(s.chasers):7}  {s.duration_s:6.0f} s" for s in scenarios]
+    texts = ["description", *(s.description for s in scenarios)]
+    columns = shutil.get_terminal_size().columns
+    in_one_line = len(head[0]) + 2 + max(map(len, texts)) <= columns
+    for first, text in zip(head, texts, strict=True):
+        if in_one_line:
+            print(f"{first}  {text}")
+        else:
+            print("\n".join([first, *wrapped([f"    {text}"], columns)]))
 
 
 def _check(names: list[str], overrides: tuple[str, ...]) -> None:

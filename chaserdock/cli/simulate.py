@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import sys
 import time
 from collections import Counter
@@ -14,11 +15,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
+from chaserdock.terminal import labelled, wrapped
 
 from .options import ModeOption, ScenarioArg, fail
 
 if TYPE_CHECKING:
     from chaserdock.simulation.flight import SimulationResult
+    from chaserdock.simulation.seeds import SeedOptions
 
 
 def _seed_range(text: str) -> range:
@@ -70,8 +73,6 @@ def simulate(
         SeedOptions,
         UnflownSeed,
         fly_seeds,
-        inaccuracies,
-        means_over,
     )
 
     _check_writable(out)
@@ -90,6 +91,7 @@ def simulate(
     results: list[SimulationResult] = []
     outcomes: Counter[str] = Counter()
     options = SeedOptions(scenario, images, None if mode is None else mode.value, to_violation=stop)
+    written: list[Path] = []
     stopped = False
 
     try:
@@ -105,24 +107,60 @@ def simulate(
             for violation in result.violations:
                 print(f"seed {result.seed}: {violation}", flush=True)
             if shrinking:
-                _shrink(result, out)
+                _shrink(result, out, written)
             if stop:
                 break
     except KeyboardInterrupt:
         stopped = True
 
-    elapsed_s = time.monotonic() - begin_s
-    failed = sum(bool(r.violations) for r in results) + outcomes["not flown"]
-    counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common()) or "none flown"
+    failed = _print_end(options, outcomes, results, written, time.monotonic() - begin_s)
+    raise typer.Exit(STOPPED if stopped else FAILED if failed else DONE)
 
-    print(f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}")
+
+def _print_end(
+    options: SeedOptions,
+    outcomes: Counter[str],
+    results: list[SimulationResult],
+    written: list[Path],
+    elapsed_s: float,
+) -> bool:
+    """Print means, verdict, what was written, and a command to go on. Returns whether a seed, or a
+    mean over seeds, is not as it should be.
+    """
+    from chaserdock.simulation.seeds import inaccuracies, means_over
+
     for (expected, subject), means in means_over(results).items():
         mean = sum(means) / len(means)
         print(f"{subject}: mean {expected.name} {mean:.2f} over {len(means)} flights")
-    for reason in inaccuracies(results):
+    wrong = inaccuracies(results)
+    for reason in wrong:
         print(f"chaserdock: {reason}", file=sys.stderr)
-        failed += 1
-    raise typer.Exit(STOPPED if stopped else FAILED if failed else DONE)
+    failed = sum(bool(r.violations) for r in results) + outcomes["not flown"]
+    counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common() if n) or "none flown"
+    holds = [f"{failed} failed"] if failed else ["no invariant is violated"] if results else []
+    holds += ["means are not as expected"] if wrong else []
+    verdict = "; ".join([f"{outcomes.total()} seeds in {elapsed_s:.0f} s: {counts}", *holds])
+    print("\n".join(wrapped([verdict])))
+    if written:
+        print("\n".join(labelled("written", str(path)) for path in written))
+    else:
+        print("written: nothing" if failed else "written: nothing, as no seed failed")
+    print(_again(options, results, written))
+    return bool(failed or wrong)
+
+
+def _again(options: SeedOptions, results: list[SimulationResult], written: list[Path]) -> str:
+    """Return a line with the command that flies the first failure again, else the last seed."""
+    if written:
+        command = ["chaserdock", "simulate", str(written[0])]
+        return labelled("again, with its log", shlex.join(command))
+    if not results:
+        return "again: no seed was flown"
+    seed = next((r for r in results if r.violations), results[-1]).seed
+    command = ["chaserdock", "simulate", options.scenario, "--seeds", str(seed)]
+    command += [] if options.mode is None else ["--mode", options.mode]
+    command += ["--images"] if options.images else []
+    return labelled(f"seed {seed} again", shlex.join(command))
 
 
 def _check_writable(out: Path) -> None:
@@ -132,8 +170,10 @@ def _check_writable(out: Path) -> None:
         raise fail(f"--out {out}: {nearest} is not a folder that can be written")
 
 
-def _shrink(result: SimulationResult, out: Path) -> None:
-    """Reduce a case that fails; write and print the simplest one, on Ctrl-C that so far."""
+def _shrink(result: SimulationResult, out: Path, written: list[Path]) -> None:
+    """Reduce a case that fails; write and print the simplest one, on Ctrl-C that so far. Adds its
+    file to ``written``.
+    """
     from chaserdock.simulation.seeds import shrink_result, write_case
 
     simplest = result
@@ -143,6 +183,7 @@ def _shrink(result: SimulationResult, out: Path) -> None:
             simplest = simpler
     finally:
         path = write_case(simplest, out)
+        written.append(path)
         print(f"seed {result.seed}: shrunk to {path}:\n\n{path.read_text()}", flush=True)
 
 
@@ -164,5 +205,9 @@ def _fly_one(scenario: str, out: Path, mode: Any) -> int:
     result = fly_case(case, 0, folder)
     for violation in result.violations:
         print(violation)
-    print(f"{path.stem}: {result.outcome}, fingerprint {result.fingerprint}; log: {folder / 'run'}")
+    verdict = f"{path.stem}: {result.outcome}, fingerprint {result.fingerprint}"
+    print("\n".join(wrapped([verdict])))
+    print(labelled("log", str(folder / "run")))
+    command = ["chaserdock", "report", str(folder / "run")]
+    print(labelled("its report", shlex.join(command)))
     return FAILED if result.violations else DONE

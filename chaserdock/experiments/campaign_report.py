@@ -1,30 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Report of a campaign: pass rate, causes, sensitivities, and a link to every failure."""
+"""Report of a campaign: outcomes by cause, metrics, sensitivities, and how to see more of failures
+and of the worst runs.
+"""
 
 from __future__ import annotations
 
 import html
+import json
 import math
 import os
+import shlex
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from chaserdock.html_page import Markup
 
+from .metric_sections import WORST, metric_sections
+from .metrics import Metric, metrics
 from .page import PageSection, Table
-from .plan import ExperimentPlan, PlannedFlight
+from .plan import ExperimentPlan
 from .results import (
     ResultRow,
     cause_of,
     causes,
+    in_part,
     metrics_of,
     numbers_of,
+    qualification,
     rank_correlation,
+    rate,
     remarks,
     repeat_command,
     wilson,
 )
+from .worker import FlightOutcome
+
+TABLE, PAGE, SINGLE_RUNS = "results.parquet", "report.html", "single-runs"
+"""Files and folders of a campaign's folder: table, report, runs that were flown again."""
 
 _SHOWN = (
     ("steady_position_mse_m2", "steady position RMS, mm", lambda v: math.sqrt(v) * 1e3),
@@ -37,34 +52,71 @@ _SHOWN = (
 )
 
 
-def sections(plan: ExperimentPlan, rows: list[ResultRow], folder: Path) -> list[PageSection]:
-    """Return the report; links to logs are relative to ``folder``. Raise ValueError without any
-    row.
+def sections(
+    plan: ExperimentPlan,
+    rows: list[ResultRow],
+    outcomes: Mapping[str, FlightOutcome],
+    folder: Path,
+    command: str,
+) -> list[PageSection]:
+    """Return the report; links are relative to ``folder``, where it is written. ``command``: see
+    ``campaign_command``. Raise ValueError without any row.
     """
-    passed, ended = sum(bool(r["success"]) for r in rows), len(rows)
-    low, high = wilson(passed, ended)
-    missing = len(plan.flights) - ended
+    missing = len(plan.flights) - len(rows)
     scenarios = ", ".join(sorted({flight.scenario for flight in plan.flights}))
-    flown = f"Scenario `{scenarios}`, {ended} of {len(plan.flights)} runs flown"
+    flown = f"Scenario `{scenarios}`, {len(rows)} of {len(plan.flights)} runs flown"
     resume = f"; {missing} are missing; repeat the command to resume" if missing else ""
-    rate = Markup(
-        f'<p class="big">{passed} of {ended} passed: {100 * passed / ended:.1f} % '
-        f"(95 % confidence: {100 * low:.1f} to {100 * high:.1f} %, Wilson)</p>"
-    )
+    big = Markup(f'<p class="big">{html.escape(rate(rows))}</p>')
+    again = f"Run N again{with_log(plan)}: `{command} --only N`."
+    notes = qualification(rows)
+    qualified = [f"{', '.join(notes)}."] if notes else []
+    found = metrics(rows, outcomes)
+    head = (f"{flown}{resume}.", big, *qualified, again, *_table_link(folder))
     return [
-        PageSection("", (f"{flown}{resume}.", rate, *qualification(rows))),
-        *_causes(rows),
+        PageSection("", head),
+        *_outcomes(rows),
+        *metric_sections(found),
+        *_remarks(rows),
         *_sensitivities(plan, rows),
-        *_failures(plan, rows, folder),
+        *_runs(rows, found, folder, command),
     ]
 
 
-def _causes(rows: list[ResultRow]) -> list[PageSection]:
-    counted = tuple((str(n), cause) for cause, n in causes(rows))
-    head = ("runs", "first failure (# stands for a number)")
-    found = (
-        [PageSection("Outcomes by cause", (Table(head, counted, text=True),))] if counted else []
+def with_log(plan: ExperimentPlan) -> str:
+    """Return what a run that is flown again leaves: nothing if the controller flies alone."""
+    return "" if any(flight.module for flight in plan.flights) else ", with its log and report"
+
+
+def _table_link(folder: Path) -> Iterator[str]:
+    if (folder / TABLE).exists():
+        yield Markup(f'<p>All results as a table: <a href="{TABLE}">{TABLE}</a>.</p>')
+
+
+def _outcomes(rows: list[ResultRow]) -> list[PageSection]:
+    """Return the outcomes by cause: a bar, and a table with the share of each."""
+    part = sum(in_part(r) for r in rows)
+    counts = [
+        ("good", "passed", sum(bool(r["success"]) for r in rows) - part),
+        ("partial", "not judged in full: met what was judged", part),
+        *(("bad", f"failed: {cause}", n) for cause, n in causes(rows)),
+    ]
+    shown = [c for c in counts if c[2]]
+    parts = (
+        f'<i class="{k}" style="flex:{n}" title="{html.escape(t)}"><b>{n}</b></i>'
+        for k, t, n in shown
     )
+    bar = Markup(f'<div class="outcomes">{"".join(parts)}</div>')
+    lines: list[tuple[str, ...]] = []
+    for level, text, n in shown:
+        low, high = wilson(n, len(rows))
+        share = f"{100 * n / len(rows):.1f} % ({100 * low:.1f} to {100 * high:.1f} %)"
+        lines.append((str(n), share, Markup(f'<span class="{level}">{html.escape(text)}</span>')))
+    head = ("runs", "share (95 %, Wilson)", "outcome (# stands for a number)")
+    return [PageSection("Outcomes by cause", (bar, Table(head, tuple(lines), text=True)))]
+
+
+def _remarks(rows: list[ResultRow]) -> list[PageSection]:
+    found: list[PageSection] = []
     for title, kind in (("Criteria not judged", "not_judged"), ("Doubtful estimates", "doubts")):
         lines = tuple((str(n), text) for text, n in remarks(rows, kind))
         if lines:
@@ -76,17 +128,6 @@ def _causes(rows: list[ResultRow]) -> list[PageSection]:
         head = ("runs", "end of the flight (# stands for a number)")
         found.append(PageSection("Ends", (Table(head, lines, text=True),)))
     return found
-
-
-def qualification(rows: list[ResultRow]) -> list[str]:
-    """Return a line about the passed runs whose verdict is qualified; none without any."""
-    passed = [r for r in rows if r["success"]]
-    counts = (
-        (sum(r["not_judged"] != "[]" for r in passed), "with criteria not judged"),
-        (sum(r["doubts"] != "[]" for r in passed), "with a NEES out of range"),
-    )
-    texts = [f"{n} {what}" for n, what in counts if n]
-    return [f"Of the {len(passed)} that passed: {', '.join(texts)}."] if texts else []
 
 
 def _sensitivities(plan: ExperimentPlan, rows: list[ResultRow]) -> list[PageSection]:
@@ -154,23 +195,54 @@ def _by_value(parameter: str, rows: list[ResultRow]) -> Table:
     return Table(("value", "passed", "95 %"), tuple(body))
 
 
-def _failures(plan: ExperimentPlan, rows: list[ResultRow], folder: Path) -> list[PageSection]:
-    """Return the runs that failed, each with its cause, a link to its log, and the command that
-    repeats it.
+def _runs(
+    rows: list[ResultRow], found: list[Metric], folder: Path, command: str
+) -> list[PageSection]:
+    """Return the runs that failed or are among the worst of a metric, each with what is known of
+    it and how to see more.
     """
-    flights: dict[str, PlannedFlight] = {flight.name: flight for flight in plan.flights}
+    worst: dict[int, list[str]] = {}
+    for m in found:
+        for run in m.worst(WORST):
+            worst.setdefault(run.run, []).append(f"{m.name} {m.text(run.value or 0.0)}")
     body: list[tuple[str, str]] = []
     for r in rows:
-        if r["success"]:
+        index, failures = int(r["index"]), json.loads(r["failures"])
+        if r["success"] and index not in worst:
             continue
-        log = Path(str(r["log"]))
-        if log.is_absolute():
-            shown = html.escape(os.path.relpath(log, folder))
-            link = f'<a href="{shown}">{shown}</a>'
-        else:
-            link = html.escape(str(r["log"])) or "not kept"
-        command = html.escape(repeat_command(flights[str(r["run"])]))
-        cause = html.escape(str(r["cause"]))
-        body.append((str(r["index"]), Markup(f"{cause}<br>{link}<br><code>{command}</code>")))
-    head = ("run", "cause, log and command that repeats the run")
-    return [PageSection("Failures", (Table(head, tuple(body), text=True),))] if body else []
+        varied = [f"{k.removeprefix('vary.')}={r[k]}" for k in r if k.startswith("vary.")]
+        texts = [", ".join([*varied, f"seed {r['seed']}"])]
+        texts += [f"failed: {text}" for text in failures]
+        texts += [f"among the worst: {', '.join(worst[index])}"] if index in worst else []
+        lines = [*map(html.escape, texts), *_ways(r, folder, repeat_command(command, index))]
+        body.append((Markup(f'<span id="run-{index}">{index}</span>'), Markup("<br>".join(lines))))
+    head = ("run", "what is known of it, and how to see more")
+    return (
+        [PageSection("Failures and worst runs", (Table(head, tuple(body), text=True),))]
+        if body
+        else []
+    )
+
+
+def _ways(row: ResultRow, folder: Path, again: str) -> Iterator[str]:
+    """Yield links to what is there of a run, and the commands that make what is not."""
+    log = Path(str(row["log"]))
+    single = folder / SINGLE_RUNS / str(row["run"])
+    kept = [log.parent] if log.is_absolute() else []
+    pages = (where / PAGE for where in (*kept, single))
+    page = next((page for page in pages if page.is_file()), None)
+    links = [] if page is None else [_link(page, folder, "report")]
+    if log.is_absolute():
+        links.append(_link(log, folder, "log"))
+    elif row["log"]:  # on another machine
+        links.append(html.escape(str(row["log"])))
+    if links:
+        yield ", ".join(links)
+    if page is None and log.is_absolute():
+        yield f"report: <code>{html.escape(shlex.join(['chaserdock', 'report', str(log)]))}</code>"
+    yield f"again: <code>{html.escape(again)}</code>"
+
+
+def _link(path: Path, folder: Path, name: str) -> str:
+    target = quote(os.path.relpath(path, folder))
+    return f'<a href="{target}">{name}</a>'

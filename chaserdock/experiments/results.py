@@ -6,10 +6,12 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from chaserdock_protocol.output_files import replaced
@@ -41,6 +43,7 @@ _OF_CHASERS: tuple[tuple[str, tuple[str, ...], Callable[[list[float]], float]], 
     ("orientation_mse_rad2", ("orientation_mse_rad2",), max),
     ("relative_estimate_position_rms_m", ("relative_estimate", "position_rms_m"), max),
     ("relative_estimate_orientation_rms_rad", ("relative_estimate", "orientation_rms_rad"), max),
+    ("relative_estimate_nees", ("relative_estimate", "nees_mean"), fmean),
     ("min_distance_target_m", ("min_distance_target_m",), min),
     ("impulse_N_s", ("impulse_N_s",), sum),
 )
@@ -153,6 +156,33 @@ def wilson(passed: int, total: int, confidence: float = 0.95) -> tuple[float, fl
     return float(interval.low), float(interval.high)
 
 
+def in_part(row: ResultRow) -> bool:
+    """Return whether a run met what was judged, but not all of its criteria were."""
+    return bool(row["success"]) and row["not_judged"] != "[]"
+
+
+def rate(rows: list[ResultRow]) -> str:
+    """Return the pass rate of the runs that failed or met all criteria."""
+    judged = [r for r in rows if not in_part(r)]
+    if not judged:
+        return f"{len(rows)} flown"
+    passed = sum(bool(r["success"]) for r in judged)
+    low, high = wilson(passed, len(judged))
+    return (
+        f"{passed} of {len(judged)} passed, {100 * passed / len(judged):.1f} % "
+        f"(95 %: {100 * low:.1f} to {100 * high:.1f} %)"
+    )
+
+
+def qualification(rows: list[ResultRow]) -> list[str]:
+    """Return the numbers of runs whose success is qualified; none without any."""
+    counts = (
+        (sum(in_part(r) for r in rows), "not judged in full"),
+        (sum(bool(r["success"]) and r["doubts"] != "[]" for r in rows), "with a NEES out of range"),
+    )
+    return [f"{n} {what}" for n, what in counts if n]
+
+
 def causes(rows: list[ResultRow]) -> list[tuple[str, int]]:
     """Return the causes of failures and their numbers of flights, most frequent first."""
     return sorted(
@@ -193,12 +223,25 @@ def numbers_of(rows: list[ResultRow], column: str) -> list[float] | None:
     return [float(v) for v in values]
 
 
-def repeat_command(flight: PlannedFlight) -> str:
-    """Return the command that flies one flight of a campaign again."""
+def campaign_command(file: Path, out: Path | None) -> str:
+    """Return the command that continues a campaign. ``out``: its folder, if given."""
+    folder = [] if out is None else ["--out", str(out)]
+    return shlex.join(["chaserdock", "campaign", str(file), *folder])
+
+
+def repeat_command(campaign: str, run: int) -> str:
+    """Return the command that flies one run again, with its log and report. ``campaign``: see
+    ``campaign_command``.
+    """
+    return f"{campaign} --only {run}"
+
+
+def run_command(flight: PlannedFlight) -> str:
+    """Return the command that flies one run again without its campaign; "" where none does."""
     if flight.module:
-        return f"chaserdock campaign FILE --only {flight.label.removeprefix('run ')}"
-    sets = " ".join(f"--set '{o}'" for o in flight.overrides)
-    return f"chaserdock run {flight.scenario} {sets}"
+        return ""
+    sets = [item for o in flight.overrides for item in ("--set", o)]
+    return shlex.join(["chaserdock", "run", flight.scenario, *sets])
 
 
 def write_table(rows: list[ResultRow], path: Path) -> None:

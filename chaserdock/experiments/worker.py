@@ -29,6 +29,7 @@ from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.recording.scan import LOG_NAME
 from msgspec import Struct
 
+from chaserdock.terminal import wrapped
 from chaserdock.verdict import verdict_of
 
 from .plan import ExperimentError, ExperimentPlan, PlannedFlight
@@ -252,4 +253,4 @@ class ExperimentProgress:
         left = f", about {left_min:.0f} min left" if ended < total else ""
         varied = ", ".join(f"{name}={value}" for name, value in flight.varied.items())
         label = flight.label + (f" ({varied})" if varied else "")
-        print(f"{ended}/{total} {label}: {verdict}{left}", flush=True)
+        print("\n".join(wrapped([f"{ended}/{total} {label}: {verdict}{left}"])), flush=True)

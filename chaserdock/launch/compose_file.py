@@ -124,7 +124,9 @@ _OBSERVERS = """
     <<: *writer
     mem_limit: 4g
     command: judge /runs --live -e tls/router:7447 --lease ${LEASE_S:-10}
-    environment: *writer-environment
+    environment:
+      <<: *writer-environment
+      HOST_RUNS: ./runs
     volumes:
       - keys-operator:/keys:ro
       - ./runs:/runs

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -31,6 +32,8 @@ from .reach import TO_JUDGE, check_rights
 
 LOG_CLOSED_S = 60.0
 """Wall time, s, after the end of the mission within which the recorder must close its log."""
+HOST_FOLDER = "HOST_RUNS"
+"""Environment variable with the path on the host of the folder that a container judges."""
 _MCAP_END = b"\x89MCAP0\r\n"
 
 
@@ -87,7 +90,9 @@ def judge_mission(
 
         outcome = judge(Fleet(), folder, failure, reporter)
         print_outcome(outcome, show)
-        _write_page(log)
+        page = _write_page(log)
+        if show is not Show.json:
+            print(files_line(folder, page), flush=True)
         return outcome.status
     finally:
         node.close()  # last, because the router may exit once this node has left
@@ -132,14 +137,26 @@ def _watch(
     return None
 
 
-def _write_page(log: Path) -> None:
+def _write_page(log: Path) -> Path | None:
     """Write report.html beside the log; report an error, which does not change the verdict."""
     from chaserdock.analysis.report import write_report
 
     try:
-        write_report(log)
+        return write_report(log)
     except ChaserdockError as error:
         print(f"chaserdock: no report.html: {error}", file=sys.stderr)
+        return None
+
+
+def files_line(folder: Path, page: Path | None) -> str:
+    """Return the folder of a mission, as the host of a container names it, and its files."""
+    from chaserdock.analysis.summary import SUMMARY_NAME
+
+    host = os.environ.get(HOST_FOLDER)
+    where = str(folder) if host is None else f"on the host, {host}/{folder.name}"
+    report = [] if page is None else [page.name]
+    others = [name for name in (LOG_NAME, SUMMARY_NAME) if (folder / name).is_file()]
+    return f"{where}: {', '.join([*report, *others])}"
 
 
 def _wait_for_end(log: Path) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import socket
@@ -39,6 +40,7 @@ from chaserdock_protocol.transport.session import find_world, ignore_foreign_pub
 from chaserdock_world.requirements import require_packages
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
+from chaserdock.terminal import labelled
 
 from .container import is_listening
 from .json_events import Failed, JsonLine, Result, Start
@@ -539,14 +541,19 @@ def judge(
 
 
 def print_outcome(outcome: MissionOutcome, show: Show) -> None:
-    """Print the verdict: on standard output unless that carries JSON lines; a failure on standard
-    error.
+    """Print the verdict, on standard output unless that carries JSON lines, and a failure on
+    standard error.
     """
     from chaserdock.analysis.summary import print_summary
 
     if outcome.summary is not None and show is not Show.json:
         print_summary(outcome.summary)
-        print(f"log, summary and output of the processes: {outcome.folder}")
     if outcome.failure is not None:
         prefix = "" if outcome.summary is None else "failed: "
         print(f"chaserdock: {prefix}{outcome.failure}", file=sys.stderr)
+
+
+def print_where(outcome: MissionOutcome) -> None:
+    """Print where the log of a mission is, and the command that makes its report."""
+    print(labelled("log, summary, output of the processes", str(outcome.folder)))
+    print(labelled("its report", shlex.join(["chaserdock", "report", str(outcome.folder)])))

@@ -29,6 +29,7 @@ from chaserdock.experiments.campaign_report import sections
 from chaserdock.experiments.page import html as html_of
 from chaserdock.experiments.plan import Alone, ExperimentError, ExperimentPlan
 from chaserdock.experiments.results import (
+    campaign_command,
     cause_of,
     causes,
     rank_correlation,
@@ -261,10 +262,13 @@ def test_report_counts_passes_and_links_failures(tmp_path: Path) -> None:
     outcomes = outcomes_of(campaign)
     del outcomes[campaign.flights[-1].name]
     rows = rows_of(campaign, outcomes)
-    text = html_of(campaign.name, sections(campaign, rows, Path("/logs/here")))
+    command = campaign_command(Path("/c d.toml"), Path("/logs/here"))
+    page = sections(campaign, rows, outcomes, Path("/logs/here"), command)
+    text = html_of(campaign.name, page)
     assert "4 of 7 passed" in text
     assert "1 are missing" in text
-    assert "--set 'seed=5'" in html.unescape(text)
+    again = "chaserdock campaign '/c d.toml' --out /logs/here --only 5"
+    assert f"again: <code>{again}</code>" in html.unescape(text)
     collector = LinkCollector()
     collector.feed(text)
     assert {link for link in collector.links if link.endswith(".mcap")} == {

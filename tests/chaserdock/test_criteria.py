@@ -477,6 +477,18 @@ def test_table_fits_the_terminal_and_says_the_same_everywhere() -> None:
     assert '<td class="partial">not judged</td>' in shown[1]
 
 
+def test_table_of_many_chasers_and_long_values_fits_the_terminal() -> None:
+    rows = [
+        criterion("a", "steady orientation RMS", -0.012345, 0.5323, "mm/s", i, "at least", met=True)
+        for i in range(16)
+    ]
+    rows.append(Criterion(key="b", name="orientation estimate", outcome="not judged"))
+    lines = text_table(rows)
+    assert max(map(len, lines)) <= COLUMNS
+    assert "worst of 16" in lines[1]
+    assert lines[1].endswith("≥ 0.5323 mm/s")
+
+
 def test_a_latch_that_let_go_is_no_capture() -> None:
     """The last rejected touch says why no other closed it."""
     s = load_scenario(DETUMBLE)

@@ -53,7 +53,7 @@ def test_demo_docks_and_leaves_report_and_film(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["success"]
-    assert str(folder / "report.html") in done.stdout
+    assert (folder / "report.html").as_uri() in done.stdout
     assert (folder / "report.html").is_file()
     with av.open(str(folder / demo.FILM)) as film:
         seconds = float(film.duration or 0) / 1e6

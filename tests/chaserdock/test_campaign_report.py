@@ -215,6 +215,7 @@ def test_commands_of_the_report_parse_and_name_what_is_there(flown: Path) -> Non
     assert load_campaign(Path(repeats[0][2])).name == "seeds"
 
 
+@pytest.mark.slow
 def test_command_of_the_report_repeats_a_run(tmp_path: Path) -> None:
     """A run of the controller alone, which takes seconds; no criterion judges it."""
     file, out = tmp_path / "c.toml", tmp_path / "o"

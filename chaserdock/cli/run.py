@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -54,7 +55,10 @@ def run(
     quiet: QuietOpt = False,
     as_json: JsonLinesOpt = False,
     view: Annotated[
-        bool, typer.Option("--view", help="serve the live viewer, too (see `view`)")
+        bool,
+        typer.Option(
+            "--view", help="serve the viewer, too, until its last tab is closed (see `view`)"
+        ),
     ] = False,
     keys: KeysOpt = None,
     stall_s: StallOpt = DEFAULT_STALL_S,
@@ -73,7 +77,7 @@ def run(
     """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the
     flight is a success.
     """
-    from chaserdock.launch.launcher import fly_mission, print_outcome
+    from chaserdock.launch.launcher import Viewer, fly_mission, print_outcome
     from chaserdock.launch.signals import stop_on_signals
     from chaserdock.viewer.address import (
         DEFAULT_HOST,
@@ -84,13 +88,13 @@ def run(
     )
 
     show = show_of(quiet, as_json)
-    with errors_as_json(as_json), stop_on_signals() as stop:
+    with errors_as_json(as_json), stop_on_signals() as stop, ExitStack() as stack:
         scenario = _flown(scenario, like)
-        viewer_port = None
+        viewer = None
         if view:
-            viewer_port = free_port(DEFAULT_HOST, None)
+            viewer = stack.enter_context(Viewer(free_port(DEFAULT_HOST, None)))
             os.environ[TOKEN_VARIABLE] = token = page_token()  # read by the viewer's process
-            announce_viewer(viewer_port, url_of(DEFAULT_HOST, viewer_port, token))
+            announce_viewer(viewer.port, url_of(DEFAULT_HOST, viewer.port, token))
         outcome = fly_mission(
             scenario,
             out,
@@ -100,12 +104,15 @@ def run(
             keys=keys,
             stall_s=stall_s,
             show=show,
-            viewer_port=viewer_port,
+            viewer=viewer,
             stop_requested=stop.is_set,
             port=port,
             namespace=namespace,
         )
-    print_outcome(outcome, show)
+        print_outcome(outcome, show)
+        if viewer is not None and viewer.is_shown() and not stop.is_set():
+            print("the viewer ends when its last tab is closed, or by Ctrl-C", file=sys.stderr)
+            viewer.wait(stop.is_set)
     raise typer.Exit(outcome.status)
 
 

@@ -410,7 +410,7 @@ class Page:
         except LogError:
             drawn = np.zeros((*size_px[::-1], 3), np.uint8)
         fitting = drawn if drawn.shape[1::-1] == size_px else cv2.resize(drawn, size_px)
-        return with_age(fitting, age_s) if age_s > OLD_S else fitting
+        return with_age(np.asarray(fitting, np.uint8), age_s) if age_s > OLD_S else fitting
 
 
 def with_age(image: NDArray[np.uint8], age_s: float) -> NDArray[np.uint8]:

@@ -100,7 +100,7 @@ def show_flown(
         mission = LoggedMission(options.folder)
     except LogError as error:
         print_status("viewer", str(error))
-        server.gui.add_markdown(f"⛔ {error}")
+        server.gui.add_markdown(f"✗ {error}")
         while not stop():
             time.sleep(PERIOD_S)
         return

@@ -166,11 +166,10 @@ def earth(direction: Array, radius_rad: float, to_sun: Array, reach_m: float) ->
     triangles = halves.transpose(0, 2, 3, 1).reshape(-1, 3)
 
     noise = np.random.default_rng(0)
-    clouds = sum(
-        0.6**k * _stretched(noise.standard_normal((3 << k, 6 << k)), (rings, sides))
-        for k in range(3)
-    )
-    share = np.clip(0.35 + 0.35 * np.asarray(clouds), 0.0, 1.0)[..., None]
+    clouds = np.zeros((rings, sides))
+    for k in range(3):
+        clouds += 0.6**k * _stretched(noise.standard_normal((3 << k, 6 << k)), (rings, sides))
+    share = np.clip(0.35 + 0.35 * clouds, 0.0, 1.0)[..., None]
     albedo = (1.0 - share) * np.array(_SEA_RGB) + share * np.array(_CLOUD_RGB)
     sun = np.asarray(to_sun) / np.linalg.norm(to_sun)
     colours = albedo * np.maximum(_NIGHT, normals @ sun)[..., None]
@@ -183,7 +182,7 @@ def _stretched(coarse: Array, size: tuple[int, int]) -> Array:
     """Return noise (rows, columns) interpolated to ``size``, continuous across its last column."""
     wrapped = np.concatenate([coarse, coarse[:, :1]], axis=1)
     whole = cv2.resize(wrapped, (size[1] + 1, size[0]), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(whole[:, :-1])
+    return np.asarray(whole[:, :-1], dtype=float)
 
 
 def corridor_of(scenario: FlightScenario, chaser: int) -> NDArray[np.float32] | None:

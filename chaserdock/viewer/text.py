@@ -15,8 +15,8 @@ from chaserdock.verdict import Verdict
 from .history import History, Line
 from .snapshot import ChaserState, MissionState
 
-_MARKS = {"info": "", "warning": "⚠ ", "error": "⛔ "}
-_VERDICT_MARKS = {"good": "✓ ", "partial": "⚠ ", "bad": "⛔ "}
+_MARKS = {"info": "", "warning": "⚠ ", "error": "✗ "}
+_VERDICT_MARKS = {"good": "✓ ", "partial": "⚠ ", "bad": "✗ "}
 _FRESH_S = 2.0
 """Age (s) up to which a latency is shown: that of stopped images is out of date."""
 _GOOD_SOLVES = frozenset({"solved", "iteration_limit"})
@@ -52,7 +52,7 @@ def head(
         lines.append("the log is being judged")
     elif state.ended is not None:
         lines.append(
-            f"{'ended' if state.ended.complete else '⛔ ended early'}: {state.ended.reason}"
+            f"{'ended' if state.ended.complete else '✗ ended early'}: {state.ended.reason}"
         )
         lines.append("the verdict needs the log: `chaserdock judge`")
     if report is not None:

@@ -8,11 +8,14 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
+import cv2
+import numpy as np
 import psutil
 import pytest
 from browser import chromium, freeze, open_page, why_no_browser
@@ -113,6 +116,25 @@ def test_on_a_phone_the_panel_is_below_the_scene() -> None:
         beside = page.locator("canvas[data-engine]").bounding_box()
         assert beside is not None
         assert beside["width"] > 500.0
+
+
+@needs_browser
+@pytest.mark.slow
+def test_pictures_of_the_viewer_are_made_of_today_s_page(tmp_path: Path) -> None:
+    """By the script, of which docs/viewer.md shows every picture."""
+    script = ROOT / "docs" / "make_viewer_images.py"
+    command = [sys.executable, str(script), str(tmp_path), "--log", str(GOLDEN), "--at", "1.0"]
+    subprocess.run(command, check=True, timeout=LONG_S)
+    page = (ROOT / "docs" / "viewer.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"\]\(images/(viewer-\w+\.webp)\)", page))
+    assert {file.name for file in tmp_path.iterdir()} == shown
+    sizes = {}
+    for name in shown:
+        image = np.asarray(cv2.imread(str(tmp_path / name)))
+        sizes[name] = image.shape[1::-1]
+        assert image.std() > 10.0
+    assert sizes["viewer-phone.webp"] == (390, 844)
+    assert sizes["viewer-log.webp"] == (1280, 800)
 
 
 # -- a running mission -----------------------------------------------------------------------------

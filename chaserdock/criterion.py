@@ -214,7 +214,7 @@ def markdown_table(criteria: Sequence[Criterion]) -> str:
     """Return the table as Markdown for a narrow panel; empty without criteria."""
     if not criteria:
         return ""
-    marks = {"met": "✓", "not met": "⛔", "not judged": "⚠"}
+    marks = {"met": "✓", "not met": "✗", "not judged": "⚠"}
     lines = ["| | criterion | measured | limit | margin |", "| --- | --- | --- | --- | --- |"]
     for row in table_rows(criteria):
         c = row.criterion

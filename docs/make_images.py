@@ -90,6 +90,7 @@ class Box:
     kind: str = "real"
     width: float = 0.78
     height: float = 0.5
+    font_pt: float = 9.0
 
 
 def diagram(
@@ -124,8 +125,9 @@ def diagram(
             )  # fmt: skip
             axes.add_patch(patches[key])
             axes.text(
-                box.x * cell[0], box.y * cell[1], box.text, ha="center", va="center", fontsize=9
-            )
+                box.x * cell[0], box.y * cell[1], box.text,
+                ha="center", va="center", fontsize=box.font_pt,
+            )  # fmt: skip
         for begin, end, label, *bend in arrows:
             a, b = boxes[begin], boxes[end]
             x = float(np.clip(a.x, b.x - b.width / 2, b.x + b.width / 2)) if b.width > 1.5 else b.x
@@ -742,6 +744,30 @@ def results() -> None:
         save(figure, "results")
 
 
+def tables_of_reproduction(text: str) -> dict[str, Any]:
+    """Return the tables of errors of docs/reproduction.md by quantity."""
+    from chaserdock.experiments.page import Table
+    from chaserdock.experiments.reproduction.tables import QUANTITIES
+
+    tables: dict[str, Any] = {}
+    for quantity in QUANTITIES:
+        part = text.partition(f"## Table: {quantity}\n")[2].partition("\n## ")[0]
+        lines = [line for line in part.splitlines() if line.startswith("| ")]
+        header, _, *rows = (tuple(c.strip() for c in line.split("|")[1:-1]) for line in lines)
+        tables[quantity] = Table(header, tuple(rows))
+    return tables
+
+
+def reproduction() -> None:
+    """The curves of docs/reproduction.md, from its tables."""
+    from chaserdock.experiments.page import Picture
+    from chaserdock.experiments.reproduction.curves import PATH, curves_section
+
+    tables: Any = tables_of_reproduction((ROOT / "docs" / "reproduction.md").read_text("utf-8"))
+    (picture,) = (p for p in curves_section(tables).parts if isinstance(p, Picture))
+    (ROOT / "docs" / PATH).write_text(picture.file, encoding="utf-8")
+
+
 # -- cameras ---------------------------------------------------------------------------------------
 
 
@@ -900,7 +926,7 @@ PICTURES: dict[str, Callable[[], None]] = {
     "laboratory": laboratory, "planar": planar,
     "controller": controller, "estimation": estimation, "detumble": detumble,
     "docking": docking, "faults": faults, "steady": steady,
-    "results": results, "thrusters": thrusters,
+    "results": results, "reproduction-curves": reproduction, "thrusters": thrusters,
     "targets": targets, "track": tracked, "dataset": dataset, "report": report,
     "campaign": campaign,
     "terminal": first_flight, "status": log_info,

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes docs/phases.md from the transition table of guidance: ``python docs/make_phases.py``;
-``--print`` prints it.
+"""Writes docs/phases.md with its diagrams from the transition table of guidance: ``python
+docs/make_phases.py``; ``--print`` prints the page.
 """
 
 from __future__ import annotations
@@ -51,16 +51,81 @@ MEANING = {
 }
 
 
-def diagram(by_capture: bool) -> str:
-    """Return the state diagram of one kind of docking in mermaid."""
-    edges: dict[tuple[str, str], list[str]] = {}
+_LISTED = 3
+"""Most sources of a trigger that a diagram names; it counts more."""
+_AT: dict[bool, dict[Phase, tuple[float, float]]] = {
+    False: {
+        Phase.ACQUIRE: (0.0, 3.0), Phase.HOLD: (2.2, 3.0), Phase.APPROACH: (4.5, 3.0),
+        Phase.DOCKED: (6.5, 3.0), Phase.SEARCHING: (0.0, 1.5), Phase.GOTO: (0.0, 0.5),
+        Phase.CALIBRATE: (1.4, 1.2), Phase.INSPECT: (3.3, 1.2), Phase.RETREAT: (4.5, 1.5),
+        Phase.ABORT: (6.3, 1.5),
+    },
+    True: {
+        Phase.ACQUIRE: (0.0, 5.0), Phase.HOLD: (2.2, 5.0), Phase.WAIT: (3.9, 5.0),
+        Phase.ALIGN: (5.4, 5.0), Phase.APPROACH: (6.9, 5.0), Phase.FINAL: (6.9, 4.0),
+        Phase.CONTACT: (6.9, 3.0), Phase.SEARCHING: (0.0, 3.6), Phase.GOTO: (0.0, 2.6),
+        Phase.CALIBRATE: (1.4, 3.2), Phase.INSPECT: (3.3, 3.2), Phase.RETREAT: (4.7, 3.8),
+        Phase.ABORT: (3.3, 2.0), Phase.LATCHED: (6.9, 1.0), Phase.VERIFIED: (5.0, 1.0),
+        Phase.IDENTIFY: (5.9, -0.5), Phase.DETUMBLE: (2.9, -0.5), Phase.STACK_HOLD: (0.8, -0.5),
+    },
+}  # fmt: skip
+"""Places of the phases in the diagrams, cells."""
+_BESIDE: dict[bool, dict[Phase, tuple[float, float]]] = {
+    False: {
+        Phase.SEARCHING: (0.0, 2.25), Phase.HOLD: (2.2, 3.95), Phase.APPROACH: (4.5, 3.8),
+        Phase.GOTO: (1.4, 0.3), Phase.RETREAT: (4.5, 0.6), Phase.ABORT: (6.3, 0.6),
+    },
+    True: {
+        Phase.SEARCHING: (0.0, 4.3), Phase.HOLD: (1.7, 6.0), Phase.WAIT: (3.9, 6.0),
+        Phase.ALIGN: (5.8, 6.0), Phase.GOTO: (0.0, 1.8), Phase.RETREAT: (5.0, 2.5),
+        Phase.ABORT: (1.7, 2.0), Phase.LATCHED: (6.9, 0.1), Phase.VERIFIED: (2.7, 1.0),
+        Phase.DETUMBLE: (2.9, 0.25),
+    },
+}  # fmt: skip
+"""Places of the triggers that lead to a phase from several others."""
+
+
+def triggers(by_capture: bool) -> tuple[dict[Phase, list[str]], dict[tuple[Phase, Phase], str]]:
+    """Return what a diagram shows of the transition table of one kind of docking: by target, the
+    triggers from several phases, each with these; and the triggers of the other transitions.
+    """
+    sources: dict[tuple[str, Phase], list[Phase]] = {}
     for t in TRANSITIONS:
         if t.by_capture in (None, by_capture):
-            for source in t.sources:
-                edges.setdefault((source, t.target), []).append(t.trigger)
-    lines = ["```mermaid", "stateDiagram-v2", f"    [*] --> {Phase.ACQUIRE}"]
-    lines += [f"    {a} --> {b}: {'<br>'.join(triggers)}" for (a, b), triggers in edges.items()]
-    return "\n".join([*lines, "```"])
+            sources.setdefault((t.trigger, t.target), []).extend(t.sources)
+    several: dict[Phase, list[str]] = {}
+    single: dict[tuple[Phase, Phase], list[str]] = {}
+    for (trigger, target), phases in sources.items():
+        if len(phases) == 1:
+            single.setdefault((phases[0], target), []).append(trigger)
+            continue
+        named = len(phases) <= _LISTED
+        whence = ", ".join(phases) if named else f"{len(phases)} phases"
+        several.setdefault(target, []).append(f"{trigger}: {whence}")
+    return several, {ends: "\n".join(each) for ends, each in single.items()}
+
+
+def draw(by_capture: bool) -> None:
+    """Write the state diagram of one kind of docking as docs/images/phases-KIND.svg."""
+    from make_images import Box, diagram
+
+    several, single = triggers(by_capture)
+    boxes: dict[str, Box] = {
+        str(p): Box(x, y, p, "real", 0.72, 0.36) for p, (x, y) in _AT[by_capture].items()
+    }
+    arrows: list[tuple[str, str, str] | tuple[str, str, str, float]] = []
+    for target, lines in several.items():
+        x, y = _BESIDE[by_capture][target]
+        text = "\n".join(lines).replace(", or odometry", ",\nor odometry")
+        rows = text.split("\n")
+        width, height = 0.15 + 0.0365 * max(map(len, rows)), 0.14 + 0.17 * len(rows)
+        boxes[f"to {target}"] = Box(x, y, text, "person", width, height, 7.0)
+        arrows.append((f"to {target}", target, "", 0.0))
+    for (source, target), label in single.items():
+        bend = 0.25 if (target, source) in single else 0.0
+        arrows.append((source, target, label.replace(", ", ",\n"), bend))
+    kind = "capture" if by_capture else "distance"
+    diagram(f"phases-{kind}", boxes, arrows, (1.45, 0.92), 0.4)
 
 
 def row(t: Transition) -> str:
@@ -69,16 +134,25 @@ def row(t: Transition) -> str:
     return f"| {', '.join(t.sources)} | {t.trigger} | {t.target} | {docking} |"
 
 
+def picture(kind: str) -> str:
+    """Return a diagram with its caption in Markdown."""
+    return (
+        f"![Phases and what leads from one to another](images/phases-{kind}.svg)\n\n"
+        "*Boxes in violet: what leads to a phase from several others. Made by "
+        "`python docs/make_phases.py`.*"
+    )
+
+
 def page() -> str:
     """Return the page."""
     phases = "".join(f"| `{phase}` | {MEANING[phase]} |\n" for phase in Phase)
     rows = "\n".join(map(row, TRANSITIONS))
     return f"""{INTRODUCTION}{phases}
 ## Docking at a distance
-{diagram(by_capture=False)}
+{picture("distance")}
 
 ## Docking by capture
-{diagram(by_capture=True)}
+{picture("capture")}
 
 ## Transitions
 | from | trigger | to | docking |
@@ -90,4 +164,9 @@ def page() -> str:
 if __name__ == "__main__":
     from page_command import run
 
-    run(__doc__, PAGE, page)
+    def page_and_diagrams() -> str:
+        draw(by_capture=False)
+        draw(by_capture=True)
+        return page()
+
+    run(__doc__, PAGE, page_and_diagrams)

@@ -39,6 +39,12 @@ _INLINE_MATH = re.compile(r"\$`(.+?)`\$")
 _LANGUAGES = {".py": "python", ".toml": "toml", ".yaml": "yaml", ".sh": "sh"}
 
 
+_SHOWN = frozenset({"", "math", "text", "sh", "python", "toml", "yaml", "json", "sql", "c", "cpp"})
+"""Languages of fences that the site shows as what they are. A diagram in another one, such as
+mermaid, would be shown as its source text: the page makes no requests, so it has no script for it.
+"""
+
+
 class SiteError(Exception):
     """The site could not be built."""
 
@@ -115,6 +121,11 @@ class Stage:
         place.parent.mkdir(parents=True, exist_ok=True)
         if file.suffix == ".md":
             text = self.with_links(file.read_text(encoding="utf-8"), file)
+            if hidden := {found[2] for found in _FENCE.finditer(text)} - _SHOWN:
+                raise SiteError(
+                    f"{file.relative_to(ROOT)}: ```{min(hidden)} would be shown as its source "
+                    "text; show a picture"
+                )
             place.write_text(with_mathematics(text), encoding="utf-8")
         elif file.suffix == ".ipynb":
             text = self.with_links(notebook_page(file, place.parent), file)

@@ -48,9 +48,14 @@ def chromium() -> Iterator[Browser]:
             browser.close()
 
 
-def open_page(browser: Browser, url: str, width_px: int = 1000, height_px: int = 600) -> Page:
-    """Open a tab on ``url`` at low resolution, which reduces the load."""
+def open_page(
+    browser: Browser, url: str, width_px: int = 1000, height_px: int = 600, script: str = ""
+) -> Page:
+    """Open a tab on ``url`` at low resolution, which reduces the load. ``script``: run before those
+    of the page.
+    """
     page = browser.new_page(viewport={"width": width_px, "height": height_px})
+    page.add_init_script(script)
     page.set_default_timeout(PATIENCE_MS)
     page.goto(f"{url}/?fixedDpr=0.3")
     return page

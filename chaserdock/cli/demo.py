@@ -11,7 +11,7 @@ import typer
 from chaserdock.terminal import labelled
 
 from .options import OutOpt
-from .run import choose_viewer_port
+from .run import choose_viewer_port, wait_for_viewer
 
 FILM = "film.mp4"
 """Name of the film in the folder of the run."""
@@ -41,26 +41,23 @@ def demo(out: OutOpt = None) -> None:
     """
     from chaserdock.analysis.report import write_report
     from chaserdock.analysis.video import write_video
-    from chaserdock.launch.launcher import fly_mission, print_outcome
+    from chaserdock.launch.launcher import Viewer, fly_mission, print_outcome
     from chaserdock.launch.progress import Show
     from chaserdock.launch.signals import stop_on_signals
 
     print(SEEN, flush=True)
-    with stop_on_signals() as stop:
+    with stop_on_signals() as stop, Viewer(choose_viewer_port(has_display())) as viewer:
         outcome = fly_mission(
-            "demo",
-            out,
-            show=Show.text,
-            viewer_port=choose_viewer_port(open_page=has_display()),
-            stop_requested=stop.is_set,
+            "demo", out, show=Show.text, viewer=viewer, stop_requested=stop.is_set
         )
-    print_outcome(outcome, Show.text)
-    if outcome.summary is not None and not stop.is_set():
-        page, film = write_report(outcome.folder), outcome.folder / FILM
-        print(labelled("\nreport", page.absolute().as_uri()), flush=True)
-        write_video(outcome.folder, film, width_px=FILM_SIZE_PX[0], height_px=FILM_SIZE_PX[1])
-        print(labelled("film", film.absolute().as_uri()))
-        print(f"\n{NEXT.format(folder=outcome.folder)}", end="")
+        print_outcome(outcome, Show.text)
+        if outcome.summary is not None and not stop.is_set():
+            page, film = write_report(outcome.folder), outcome.folder / FILM
+            print(labelled("\nreport", page.absolute().as_uri()), flush=True)
+            write_video(outcome.folder, film, width_px=FILM_SIZE_PX[0], height_px=FILM_SIZE_PX[1])
+            print(labelled("film", film.absolute().as_uri()))
+            print(f"\n{NEXT.format(folder=outcome.folder)}", end="", flush=True)
+            wait_for_viewer(viewer, stop.is_set)
     raise typer.Exit(outcome.status)
 
 

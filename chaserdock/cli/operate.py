@@ -200,9 +200,10 @@ def view(
     """Show a running mission, or a log, in a web browser: scene, images, plots, phases,
     commands.
     """
-    from chaserdock.viewer.live import ViewOptions, view_live
+    from chaserdock.viewer.live import view_live
+    from chaserdock.viewer.page import ViewOptions
 
-    options = ViewOptions(host, port, dark, truth)
+    options = ViewOptions(host, port, dark, truth, link.run)
     if log:
         from chaserdock.viewer.player import view_log
 

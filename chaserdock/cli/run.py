@@ -8,9 +8,11 @@ import sys
 import threading
 import time
 import webbrowser
+from collections.abc import Callable
+from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from chaserdock_protocol.output_files import write_atomically
@@ -31,6 +33,9 @@ from .options import (
     fail,
     show_of,
 )
+
+if TYPE_CHECKING:
+    from chaserdock.launch.launcher import Viewer
 
 
 def run(
@@ -55,7 +60,10 @@ def run(
     quiet: QuietOpt = False,
     as_json: JsonLinesOpt = False,
     view: Annotated[
-        bool, typer.Option("--view", help="serve the live viewer, too (see `view`)")
+        bool,
+        typer.Option(
+            "--view", help="serve the viewer, too, until its last tab is closed (see `view`)"
+        ),
     ] = False,
     keys: KeysOpt = None,
     stall_s: StallOpt = DEFAULT_STALL_S,
@@ -74,14 +82,14 @@ def run(
     """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the
     flight is a success.
     """
-    from chaserdock.launch.launcher import fly_mission, print_outcome, print_where
+    from chaserdock.launch.launcher import Viewer, fly_mission, print_outcome, print_where
     from chaserdock.launch.progress import Show
     from chaserdock.launch.signals import stop_on_signals
 
     show = show_of(quiet, as_json)
-    with errors_as_json(as_json), stop_on_signals() as stop:
+    with errors_as_json(as_json), stop_on_signals() as stop, ExitStack() as stack:
         scenario = _flown(scenario, like)
-        viewer_port = choose_viewer_port() if view else None
+        viewer = stack.enter_context(Viewer(choose_viewer_port())) if view else None
         outcome = fly_mission(
             scenario,
             out,
@@ -91,14 +99,16 @@ def run(
             keys=keys,
             stall_s=stall_s,
             show=show,
-            viewer_port=viewer_port,
+            viewer=viewer,
             stop_requested=stop.is_set,
             port=port,
             namespace=namespace,
         )
-    print_outcome(outcome, show)
-    if outcome.summary is not None and show is not Show.json:
-        print_where(outcome)
+        print_outcome(outcome, show)
+        if outcome.summary is not None and show is not Show.json:
+            print_where(outcome)
+        if viewer is not None:
+            wait_for_viewer(viewer, stop.is_set)
     raise typer.Exit(outcome.status)
 
 
@@ -151,6 +161,13 @@ def announce_viewer(port: int, url: str, open_page: bool = False) -> threading.T
     thread = threading.Thread(target=wait, name="viewer address", daemon=True)
     thread.start()
     return thread
+
+
+def wait_for_viewer(viewer: Viewer, stop_requested: Callable[[], bool]) -> None:
+    """Leave the page of a flight that has ended to its reader, until it is closed."""
+    if viewer.is_shown() and not stop_requested():
+        print("the viewer ends when its last tab is closed, or by Ctrl-C", file=sys.stderr)
+        viewer.wait(stop_requested)
 
 
 class KeepLogs(StrEnum):

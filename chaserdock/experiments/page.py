@@ -34,13 +34,25 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Picture:
+    """A figure: ``inline`` as an element of an HTML page, and ``file``, the content of the file at
+    ``path`` beside the page, to which Markdown links.
+    """
+
+    path: str
+    title: str
+    inline: str
+    file: str
+
+
+@dataclass(frozen=True)
 class PageSection:
-    """A heading ("" for none), followed by paragraphs (text, with code in backticks), tables, and
-    HTML (``Markup``), which Markdown omits.
+    """A heading ("" for none), followed by paragraphs (text, with code in backticks), tables,
+    pictures, and HTML (``Markup``), which Markdown omits.
     """
 
     title: str
-    parts: tuple[str | Table, ...]
+    parts: tuple[str | Table | Picture, ...]
 
 
 def markdown(title: str, sections: Sequence[PageSection]) -> str:
@@ -51,6 +63,8 @@ def markdown(title: str, sections: Sequence[PageSection]) -> str:
         for part in section.parts:
             if isinstance(part, Table):
                 lines += _markdown_table(part)
+            elif isinstance(part, Picture):
+                lines += [f"![{part.title}]({part.path})", ""]
             elif not isinstance(part, Markup):
                 lines += [*_wrapped(part), ""]
     return "\n".join(lines).rstrip("\n") + "\n"
@@ -75,11 +89,18 @@ def html(title: str, sections: Sequence[PageSection]) -> str:
     for section in sections:
         if section.title:
             body.append(f"<h2>{escape(section.title)}</h2>")
-        body += [
-            table(p.header, p.rows, p.text) if isinstance(p, Table) else _paragraph(p)
-            for p in section.parts
-        ]
+        body += [_html_part(part) for part in section.parts]
     return html_page(title, body)
+
+
+def _html_part(part: str | Table | Picture) -> str:
+    if isinstance(part, Table):
+        return table(part.header, part.rows, part.text)
+    return (
+        f'<figure class="wide">{part.inline}</figure>'
+        if isinstance(part, Picture)
+        else _paragraph(part)
+    )
 
 
 def _paragraph(text: str) -> str:

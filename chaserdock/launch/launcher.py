@@ -178,6 +178,37 @@ class Fleet:
                 child.process.stdin.close()
 
 
+@dataclass
+class Viewer:
+    """The page of a mission on a TCP port: shows the flight, then its log until its last tab is
+    closed. Leaving the context ends it.
+    """
+
+    port: int
+    _fleet: Fleet = field(default_factory=Fleet)
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._fleet.end()
+
+    def start(self, folder: Path, lease_ms: int) -> None:
+        """Start the viewer of the mission that writes to ``folder``."""
+        options = ["--run", str(folder), "--lease", f"{lease_ms / 1000:g}"]
+        output = folder / "processes"
+        self._fleet.start("viewer", ["view", "--port", str(self.port), *options], output)
+
+    def is_shown(self) -> bool:
+        """Return whether it still serves the page."""
+        return bool(self._fleet.running())
+
+    def wait(self, stop_requested: Callable[[], bool]) -> None:
+        """Wait until its last tab has been closed, or a stop is requested."""
+        while self.is_shown() and not stop_requested():
+            time.sleep(0.1)
+
+
 def free_port() -> int:
     """Return a TCP port on which nothing listens."""
     with socket.socket() as probe:
@@ -277,7 +308,7 @@ def fly_mission(
     *,
     seed: int | None = None,
     show: Show = Show.none,
-    viewer_port: int | None = None,
+    viewer: Viewer | None = None,
     keys: Path | None = None,
     stop_requested: Callable[[], bool] = never,
     emit: Callable[[JsonLine], None] = print_json_line,
@@ -289,8 +320,8 @@ def fly_mission(
     """Fly a scenario. Writes log, summary and the processes' output to ``folder``, by default a new
     one in ``runs/``.
 
-    ``scenario_name``: a file, or the name of a shipped scenario. ``viewer_port``: serve the live
-    viewer there until the end of the flight. ``keys``: connect through a router, over TLS, with
+    ``scenario_name``: a file, or the name of a shipped scenario. ``viewer``: the page to start,
+    which outlives the flight. ``keys``: connect through a router, over TLS, with
     access rights. ``stall_s``: longest time (s) without progress. ``port``, ``namespace``: where
     other processes reach the mission, by default a free port and a unique name; while the mission
     flies, ``network.json`` in the folder states them. ``stop_requested``: polled. ``option``: see
@@ -350,22 +381,27 @@ def fly_mission(
         reporter.refresh()
 
         network = network_options(namespace, endpoint, lease_ms, keys)
-        if viewer_port is not None:
-            observers.start("viewer", ["view", "--port", str(viewer_port), *network], output)
+        if viewer is not None:
+            viewer.start(folder, lease_ms)
 
         stall = ["--stall-s", f"{stall_s:g}"]
         start_all(fleet, scenario, path, folder, mode, overrides, [*network, *stall])
         created.clear()
         failure = watch(fleet, hub, reporter, stop_requested, stall_s + _WORLD_ENDS_S)
+    except BaseException:
+        remove_address(folder)
+        raise
     finally:
         reporter.close()
         fleet.end()
         if hub is not None:
             hub.close()
         observers.end()
-        remove_address(folder)
         _remove(created, folder)
-    return judge(fleet, folder, failure, reporter)
+    try:
+        return judge(fleet, folder, failure, reporter)
+    finally:
+        remove_address(folder)  # tells the viewer that log and summary are complete
 
 
 def _remove(created: list[Path], folder: Path) -> None:

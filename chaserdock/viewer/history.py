@@ -6,6 +6,7 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_right
 from collections import OrderedDict, defaultdict, deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -123,13 +124,14 @@ class Trail:
 
 class History:
     """Past of a mission as the page shows it: ``series`` by quantity and chaser (None: of the
-    mission), ``trails`` by chaser, ``lines`` of events.
+    mission), ``trails`` by chaser, ``lines`` of events, known from ``begins_s`` on.
     """
 
     def __init__(self, chasers: int) -> None:
         self.series: dict[tuple[ChartQuantity, int | None], Series] = defaultdict(Series)
         self.trails = [Trail() for _ in range(chasers)]
         self.lines: deque[Line] = deque(maxlen=_MOST_LINES)
+        self.begins_s = 0.0
         self.rejected: dict[str, int] = {}
         self._odometry: dict[int, OrderedDict[int, Odometry]] = defaultdict(OrderedDict)
         self._exposed: dict[int, OrderedDict[int, int]] = defaultdict(OrderedDict)
@@ -215,6 +217,13 @@ class History:
         line = Line(time_s, level, text)
         if not self.lines or self.lines[-1] != line:
             self.lines.append(line)
+
+    def add_past(self, lines: Iterable[Line]) -> None:
+        """Add event lines of before this history began; of those known already, nothing."""
+        known = set(self.lines)
+        both = [*(line for line in lines if line not in known), *self.lines]
+        self.lines = deque(sorted(both, key=lambda line: line.time_s), maxlen=_MOST_LINES)
+        self.begins_s = 0.0
 
     def lines_until(self, time_s: float, most: int) -> list[Line]:
         """Return the latest lines up to ``time_s``, newest first."""

@@ -8,6 +8,7 @@ never delays the mission. After the end of a mission it waits for the next one.
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import threading
@@ -17,28 +18,31 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import viser
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import CommandReply, JoinReply, JoinRequest, OperatorCommand
 from chaserdock_protocol.process import StopSignal, print_status
+from chaserdock_protocol.recording.log import LogError, read_log
 from chaserdock_protocol.scenario import flight_scenario_from_json
 from chaserdock_protocol.transport import Link, Node, NoRouterError, ReceivedMessage
 from chaserdock_protocol.transport.network import unique_id
 from chaserdock_protocol.transport.session import ignore_foreign_publishers
 
 from chaserdock.exit_codes import STOPPED
+from chaserdock.launch.mission_address import ADDRESS_FILE
 from chaserdock.launch.reach import TO_VIEW, check_rights
 
-from .address import DEFAULT_HOST, page_token, url_of
-from .history import History, reply_text
-from .page import Page
+from .address import page_token, url_of
+from .history import History, Line, reply_text
+from .page import PERIOD_S, Page, ViewOptions
+from .player import show_flown
+from .report_page import NAME, ReportPage
 from .server import page_server
-from .snapshot import OF_CHASERS, MissionState
+from .snapshot import EVENT_TOPICS, OF_CHASERS, MissionState
 
-PERIOD_S = 0.1
-"""Time (s) between two drawings: as long as a tick of 10 Hz."""
 _STATES, _EVENTS = 16, 256
 """Messages of a state, and of events, that may wait for drawing: 16 states are 1.6 s at 10 Hz.
 Larger: after a pause old states are shown first; smaller: messages of a slow drawing are lost.
@@ -61,19 +65,15 @@ _DRAWING_NICE = 10
 """Priority (nice) of drawing: half of the range below that of missions on the same machine."""
 _ATTEMPT_S = 2.0
 """Longest time (s) of one attempt to connect to a router."""
+_LEFT_S = 10.0
+"""Time (s) without a tab after which a page that `chaserdock run` started ends. Smaller: loading
+the page again ends it on a slow machine.
+"""
+_PAST_PERIOD_S = 2.0
+"""Time (s) between two attempts to read the events before the viewer joined: the recorder writes
+its log to disk every 0.5 s.
+"""
 _WAITING = "no mission is running"
-
-
-@dataclass(frozen=True)
-class ViewOptions:
-    """Address and content of the page. ``truth``: subscribe to ground truth and references if
-    access rights allow it.
-    """
-
-    host: str = DEFAULT_HOST
-    port: int | None = None
-    dark: bool = False
-    truth: bool = True
 
 
 def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> int:
@@ -94,7 +94,8 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
                 Node, "viewer", "viewer", replace(link, connect_timeout_s=_ATTEMPT_S)
             ).result()
 
-        with page_server(options.host, options.port, token) as server:
+        report, place = ReportPage(), f"/{token}/{NAME}"
+        with page_server(options.host, options.port, token, {NAME: report}) as server:
             print_status(
                 "viewer",
                 f"{url_of(options.host, server.get_port(), token)} shows the mission; Ctrl-C ends "
@@ -104,10 +105,29 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
             with suppress(_Stopped):
                 while not stop():
                     mission = _next_mission(patient, server, run_id, stop)
-                    if mission is not None:
-                        run_id = mission.run_id
-                        _MissionView(patient, server, mission, options).run(stop)
+                    if mission is None:
+                        continue
+                    run_id = mission.run_id
+                    _MissionView(patient, server, mission, options).run(stop)
+                    if options.folder is not None:
+                        over = _Unwatched(server, stop) if watch_parent else stop
+                        show_flown(server, options, report, place, over)
+                        break
     return STOPPED
+
+
+class _Unwatched:
+    """Tells whether no tab has shown the page for ``_LEFT_S``, or none when it was first asked, or
+    whether ``stop`` does.
+    """
+
+    def __init__(self, server: viser.ViserServer, stop: Callable[[], bool]) -> None:
+        self._server, self._stop, self._watched_s = server, stop, -math.inf
+
+    def __call__(self) -> bool:
+        if self._server.get_clients():
+            self._watched_s = time.monotonic()
+        return self._stop() or time.monotonic() - self._watched_s > _LEFT_S
 
 
 class _Stopped(Exception):
@@ -195,13 +215,28 @@ class _Feed:
             node.subscribe_newest(topic, _STATES)
             for topic in (topics.TARGET, topics.STACK, topics.SOLVER)
         ]
-        events = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
-        feed.subscriptions += [node.subscribe_newest(topic, _EVENTS) for topic in events]
+        feed.subscriptions += [node.subscribe_newest(topic, _EVENTS) for topic in EVENT_TOPICS]
         return feed
 
     def new(self) -> list[ReceivedMessage]:
         """Return the messages received since the last call."""
         return [received for take in self.subscriptions for received in take()]
+
+
+def past_lines(log: Path, chasers: int, until_s: float) -> list[Line] | None:
+    """Return the event lines of a log that is being written, up to a tick; None if it does not yet
+    reach that tick. Raise LogError.
+    """
+    past, reached_s = History(chasers), -1.0
+    processes = ("world", *topics.CONTROLLERS, *(f"chaser/{i}" for i in range(chasers)))
+    keys = [topics.TICK.key_of(), topics.COMMAND.key_of(), topics.END.key_of()]
+    keys += [topics.EVENT.key_of(process) for process in processes]
+    for record in read_log(log, keys):
+        if record.topic is topics.TICK:
+            reached_s = max(reached_s, record.message.sim_time_ns / 1e9)
+        else:
+            past.update(record.topic, record.message, 0)
+    return past.lines_until(until_s, len(past.lines))[::-1] if reached_s >= until_s else None
 
 
 class _MissionView:
@@ -215,6 +250,8 @@ class _MissionView:
         options: ViewOptions,
     ) -> None:
         self._open_node, self._mission, self._truth = connect, mission, options.truth
+        self._folder = options.folder
+        self._read_past_s = -math.inf
         scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
         chasers = len(scenario.chasers)
         self._state, self._history = MissionState.empty(chasers), History(chasers)
@@ -234,14 +271,17 @@ class _MissionView:
         )
 
     def run(self, stop: StopSignal) -> None:
-        """Receive and draw at most ten times per second, for at most half of the time."""
+        """Receive and draw at most ten times per second, for at most half of the time. Ends when
+        another mission starts, or that of the folder is over.
+        """
         operator = threading.Thread(target=self._operate, name="operator", daemon=True)
         operator.start()
         joined_s = connected_s = time.monotonic()
         try:
-            while not stop():
+            while not stop() and not self._is_over():
                 begun_s = time.monotonic()
                 self._receive()
+                self._add_past()
                 if self._page.watched:
                     self._page.draw(
                         self._state, self._history, self._mission.mode, self._speed(), self._lost()
@@ -285,9 +325,25 @@ class _MissionView:
         for received in self._feed.new():
             self._state.update(received.topic, received.message)
             self._history.update(received.topic, received.message, received.sent_ns)
+        if tick is None:
+            self._history.begins_s = self._state.time_s()
         if self._state.tick is not tick:
             self._received_s = time.monotonic()
             self._paces.append((self._received_s, self._state.time_s()))
+
+    def _is_over(self) -> bool:
+        """Return whether the mission of the folder has ended and its log is complete."""
+        return self._folder is not None and not (self._folder / ADDRESS_FILE).exists()
+
+    def _add_past(self) -> None:
+        """Add the events before the first tick seen, as soon as the log holds them."""
+        now_s, begins_s = time.monotonic(), self._history.begins_s
+        if self._folder is None or not begins_s or now_s - self._read_past_s < _PAST_PERIOD_S:
+            return
+        self._read_past_s, chasers = now_s, len(self._state.chasers)
+        with suppress(LogError):  # not yet written
+            if (lines := past_lines(self._folder, chasers, begins_s)) is not None:
+                self._history.add_past(lines)
 
     def _speed(self) -> float | None:
         """Return simulated over wall time during the last seconds; None if unknown."""
@@ -304,8 +360,13 @@ class _MissionView:
             self._alive.discard(process)
 
     def _lost(self) -> set[str]:
-        """Return the processes that have disappeared; none after the end of the mission."""
-        return set() if self._state.ended is not None else self._seen - self._alive - {"operator"}
+        """Return the processes that have disappeared; none after the end of the mission. All leave
+        after the world.
+        """
+        if self._state.ended is not None:
+            return set()
+        lost = self._seen - self._alive - {"operator"}
+        return {"world"} if "world" in lost else lost
 
     # -- commands ----------------------------------------------------------------------------------
 

@@ -30,9 +30,8 @@ from mcap.records import Channel
 from mcap.records import Message as McapMessage
 
 from .history import History
-from .snapshot import OF_ALL, OF_CHASERS, MissionState
+from .snapshot import EVENT_TOPICS, OF_ALL, OF_CHASERS, MissionState
 
-_EVENT_TOPICS = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
 _BODIES = (topics.TRUTH_BODY, topics.BODY_REFERENCE)
 """Topics of where the bodies are."""
 _DECODED = (
@@ -45,7 +44,7 @@ _DECODED = (
     topics.TRUTH_LOAD,
     topics.ACTUATORS,
     topics.TICK,
-    *_EVENT_TOPICS,
+    *EVENT_TOPICS,
 )
 """Topics of the plots and the event list; they are decoded while the log is indexed."""
 _CHUNKS_KEPT = 24

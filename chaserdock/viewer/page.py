@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -15,16 +16,20 @@ import viser
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.scenario import FlightScenario
+from numpy.typing import NDArray
 
 from chaserdock.analysis.snapshot import annotated_image
 from chaserdock.verdict import Verdict
 
 from . import text
+from .address import DEFAULT_HOST
 from .history import History
 from .plots import COLOURS, Plot, plots_of, points_of
 from .scene import VIEWS, SceneView
-from .snapshot import MissionState
+from .snapshot import OLD_S, MissionState
 
+PERIOD_S = 0.1
+"""Time (s) between two drawings: as long as a tick of 10 Hz."""
 COMMANDS = ("approach", "hold", "retreat")
 ABORT = "abort"
 """The command that must be confirmed."""
@@ -39,7 +44,42 @@ _SLOW_S = 0.5
 """Time (s) between two updates of text and plots. Smaller: they change too fast to be read."""
 _IMAGES_S = 0.25
 """Time (s) between two updates of images. Smaller: smoother images, more load of the browser."""
+_OLD_RGB = (255, 176, 0)
+"""Colour of the age of an old image: that of warnings, on dark images."""
+_LEFT_PX, _RIGHT_PX = 380, 370
+"""Widths (px) of the panels. Larger: less of the scene on a screen of 1280 pixels."""
+_PHONE = """<style>
+@media (max-width: 36em) {
+  div:has(> .mantine-Paper-root[style*="max-height: 60%"]) { flex-direction: column; }
+  div:has(> .mantine-Paper-root[style*="max-height: 60%"]) > div[style*="flex-grow: 1"] {
+    height: auto !important; flex: 1 1 0; min-height: 0;
+  }
+  .mantine-Paper-root[style*="max-height: 60%"] {
+    position: relative !important; width: 100% !important; max-height: 55% !important;
+  }
+  .mantine-Paper-root[style*="max-height: 60%"] div[style*="width: 20em"] {
+    width: 100% !important;
+  }
+}
+</style>"""
+"""On a narrow screen: the panel of viser 1.1 below the scene, not over its lower part. The width is
+that from which viser replaces its docks by one panel; a test measures the places.
+"""
+_DECADES = [10.0**k for k in range(-3, 7)]
 _GRID = {"stroke": "rgba(128,128,128,0.25)", "width": 1}
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Address and content of the page. ``truth``: subscribe to ground truth and references if
+    access rights allow it. ``folder``: where the running mission is recorded, if known.
+    """
+
+    host: str = DEFAULT_HOST
+    port: int | None = None
+    dark: bool = False
+    truth: bool = True
+    folder: Path | None = None
 
 
 @dataclass
@@ -77,7 +117,7 @@ SPEEDS = ("0.25", "0.5", "1", "2", "5", "10", "20")
 
 class Page:
     """The page of one mission, shared by all tabs. ``command``: called on viser's threads; None for
-    a page without buttons.
+    a page without buttons. ``report``: path of the report on the server, if there is one.
     """
 
     def __init__(
@@ -89,14 +129,15 @@ class Page:
         truth: bool,
         command: SendCommand | None,
         timeline: Timeline | None,
+        report: str | None = None,
     ) -> None:
-        self._server, self._scenario = server, scenario
+        self._server, self._scenario, self._report = server, scenario, report
         self._timeline = timeline
         self._slider: Any = None
         self._drawn_s = -math.inf
         self._plotted_s = -math.inf
         self._images_s = -math.inf
-        self._shown_images: dict[int, tuple[int, bool]] = {}
+        self._shown_images: dict[int, tuple[int, bool, int]] = {}
         server.scene.reset()
         server.gui.reset()
         self._theme(dark)
@@ -118,7 +159,8 @@ class Page:
     def _main_panel(self, dark: bool, command: SendCommand | None) -> None:
         gui = self._server.gui
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(400)
+        gui.main_panel.set_width(_RIGHT_PX)
+        gui.add_html(_PHONE)
         self._head = gui.add_markdown("waiting for the first tick")
         if self._timeline is not None:
             self._time_line(self._timeline)
@@ -186,6 +228,7 @@ class Page:
             ("corridors", scene_view.show_corridors, True),
             ("keep-out", scene_view.show_keep_out, False),
             ("camera views", scene_view.show_views, True),
+            ("scale", scene_view.show_scale, True),
         )
         for name, show, at_first in toggles:
             box = gui.add_checkbox(name, at_first)
@@ -208,7 +251,7 @@ class Page:
         gui, scenario = self._server.gui, self._scenario
         images, plots = gui.add_panel(), gui.add_panel()
         images.dock_left()
-        images.set_width(480)
+        images.set_width(_LEFT_PX)
         number, camera = len(scenario.chasers), scenario.camera_model()
         self._columns = 1 if number == 1 else 2 if number <= 8 else 3
         self._tile = (round(_IMAGE_PX * camera.height_px / camera.width_px), _IMAGE_PX)
@@ -237,7 +280,12 @@ class Page:
                 self._plots.append((plot, self._chart(plot)))
 
     def _chart(self, plot: Plot) -> Any:
-        nothing = tuple(np.zeros(2) for _ in range(len(plot.curves) + 1))
+        nothing = points_of(plot, History(0), 0.0, 0.0)
+        scales: dict[str, Any] = {"x": {"time": False}}
+        y_axis: dict[str, Any] = {"grid": _GRID, "size": 55}
+        if plot.least is not None:
+            scales["y"] = {"distr": 3}  # logarithmic, with a line at each power of ten
+            y_axis |= {"splits": _DECADES, "space": 8, "ticks": {"show": False}}
         curves = [
             {
                 "label": label,
@@ -253,8 +301,8 @@ class Page:
             ({"label": "time, s"}, *curves),  # type: ignore[arg-type]
             title=plot.title,
             legend={"show": True, "live": False},
-            scales={"x": {"time": False}},
-            axes=({"grid": _GRID}, {"grid": _GRID, "size": 55}),  # type: ignore[arg-type]
+            scales=scales,
+            axes=({"grid": _GRID}, y_axis),  # type: ignore[arg-type]
             height=130,
             padding=(8, 12, 0, 0),
         )
@@ -308,10 +356,13 @@ class Page:
         )
         for element, content in (
             *mass,
-            (self._head, text.head(self._scenario, state, mode, speed, verdict)),
+            (self._head, text.head(self._scenario, state, mode, speed, verdict, self._report)),
             (self._table, text.chasers(state, history)),
             (self._faults, text.faults(state, history, lost)),
-            (self._events, text.events(history.lines_until(state.time_s(), 200), most=12)),
+            (
+                self._events,
+                text.events(history.lines_until(state.time_s(), 200), 12, history.begins_s),
+            ),
         ):
             if element.content != content:
                 element.content = content
@@ -333,26 +384,39 @@ class Page:
             if image is None:
                 continue
             sighting = state.chasers[i].sighting_in(image)
-            version = (image.sim_time_ns, sighting is not None)
+            age_s = state.time_s() - image.sim_time_ns / 1e9
+            version = (image.sim_time_ns, sighting is not None, math.floor(max(0.0, age_s) / OLD_S))
             if self._shown_images.get(i) == version:
                 continue
             self._shown_images[i], changed = version, True
             if enlarged is not None:
-                self._images.image = self._image(image, sighting, _ENLARGED_PX)
+                self._images.image = self._image(image, sighting, _ENLARGED_PX, age_s)
                 continue
             row, column = (i // self._columns) * self._tile[0], (i % self._columns) * self._tile[1]
             place = np.s_[row : row + self._tile[0], column : column + self._tile[1]]
-            self._mosaic[place] = self._image(image, sighting, _IMAGE_PX)
+            self._mosaic[place] = self._image(image, sighting, _IMAGE_PX, age_s)
         if changed:
             self._images_s = time.monotonic()
             if enlarged is None:
                 self._images.image = self._mosaic
 
-    def _image(self, image: Image, sighting: Any, width_px: int) -> Any:
-        """Return an RGB image of this width; black for an unreadable image."""
+    def _image(self, image: Image, sighting: Any, width_px: int, age_s: float) -> Any:
+        """Return an RGB image of this width, dimmed with its age if it is old; black for an
+        unreadable image.
+        """
         size_px = (width_px, round(width_px * self._tile[0] / self._tile[1]))
         try:
             drawn = annotated_image(self._scenario, image, sighting, width_px)[:, :, ::-1]
         except LogError:
             drawn = np.zeros((*size_px[::-1], 3), np.uint8)
-        return drawn if drawn.shape[1::-1] == size_px else cv2.resize(drawn, size_px)
+        fitting = drawn if drawn.shape[1::-1] == size_px else cv2.resize(drawn, size_px)
+        return with_age(np.asarray(fitting, np.uint8), age_s) if age_s > OLD_S else fitting
+
+
+def with_age(image: NDArray[np.uint8], age_s: float) -> NDArray[np.uint8]:
+    """Return an RGB image at half brightness, with its age across the bottom."""
+    old: Any = image // 2
+    text = f"{age_s:.0f} s old"
+    place = (8, image.shape[0] - 10)
+    cv2.putText(old, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8, _OLD_RGB, 2, cv2.LINE_AA)
+    return np.asarray(old, dtype=np.uint8)

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+import viser
 from chaserdock_protocol.process import StopSignal, print_status
 from chaserdock_protocol.recording.scan import LogError, LogSource
 
@@ -16,9 +18,9 @@ from chaserdock.exit_codes import STOPPED
 from chaserdock.verdict import Verdict, verdict_of
 
 from .address import page_token, url_of
-from .live import PERIOD_S, ViewOptions
 from .logged import LoggedMission
-from .page import Page, Timeline
+from .page import PERIOD_S, Page, Timeline, ViewOptions
+from .report_page import NAME, ReportPage
 from .server import page_server
 
 
@@ -36,30 +38,75 @@ def view_log(
         raise LogError(f"--at {at_s:g}: the log ends at {mission.end_s:.2f} s")
     if at_s is not None:
         line.at_s, line.playing = at_s, False
-    judgement = Judgement(source)
-    mode = f"log of run {mission.run.get('run_id', '?')}, {mission.run.get('mode', '?')}"
-    with page_server(options.host, options.port, token) as server:
-        truth = mission.truth and options.truth
-        page = Page(
-            server, mission.scenario, dark=options.dark, truth=truth, command=None, timeline=line
-        )
+    report = ReportPage(source if isinstance(source, Path) else None)
+    with page_server(options.host, options.port, token, {NAME: report}) as server:
         print_status(
             "viewer",
             f"{url_of(options.host, server.get_port(), token)} shows the log; Ctrl-C ends this",
         )
-        before_s = time.monotonic()
-        while not stop():
-            begun_s = time.monotonic()
-            if page.watched:
-                advance(line, begun_s - before_s)
-                state = mission.at(line.at_s)
-                if not truth:
-                    state.truth.clear()
-                page.draw(state, mission.history, mode, None, set(), judgement.verdict)
-            before_s = begun_s
-            took_s = time.monotonic() - begun_s
-            time.sleep(max(PERIOD_S - took_s, 0.2 * took_s))
+        link = None if report.log is None else f"/{token}/{NAME}"
+        play(server, source, mission, line, options, link, stop)
     return STOPPED
+
+
+def play(
+    server: viser.ViserServer,
+    source: LogSource,
+    mission: LoggedMission,
+    line: Timeline,
+    options: ViewOptions,
+    report: str | None,
+    stop: Callable[[], bool],
+) -> None:
+    """Show a log with its verdict and time line until ``stop``. ``report``: path of its report on
+    the server.
+    """
+    judgement = Judgement(source)
+    mode = f"log of run {mission.run.get('run_id', '?')}, {mission.run.get('mode', '?')}"
+    truth = mission.truth and options.truth
+    page = Page(
+        server,
+        mission.scenario,
+        dark=options.dark,
+        truth=truth,
+        command=None,
+        timeline=line,
+        report=report,
+    )
+    before_s = time.monotonic()
+    while not stop():
+        begun_s = time.monotonic()
+        if page.watched:
+            advance(line, begun_s - before_s)
+            state = mission.at(line.at_s)
+            if not truth:
+                state.truth.clear()
+            page.draw(state, mission.history, mode, None, set(), judgement.verdict)
+        before_s = begun_s
+        took_s = time.monotonic() - begun_s
+        time.sleep(max(PERIOD_S - took_s, 0.2 * took_s))
+
+
+def show_flown(
+    server: viser.ViserServer,
+    options: ViewOptions,
+    report: ReportPage,
+    link: str,
+    stop: Callable[[], bool],
+) -> None:
+    """Show the log in ``options.folder`` of the mission that has just ended, at its end."""
+    assert options.folder is not None
+    try:
+        mission = LoggedMission(options.folder)
+    except LogError as error:
+        print_status("viewer", str(error))
+        server.gui.add_markdown(f"✗ {error}")
+        while not stop():
+            time.sleep(PERIOD_S)
+        return
+    report.log = options.folder
+    line = Timeline(mission.end_s, mission.end_s, playing=False)
+    play(server, options.folder, mission, line, options, link, stop)
 
 
 class Judgement:

@@ -25,16 +25,22 @@ QUANTITIES = (ESTIMATE_COLOUR, *AXES_XYZ[1:])
 """Colours of curves that belong to no chaser, on a light or dark panel."""
 
 
+_LEAST_ERROR = 0.01
+"""Smallest error (mm or deg) shown: a tenth of what the estimator reaches. Smaller: a single tick
+without error compresses the scale.
+"""
+
 Curve = tuple[str, str, ChartQuantity, int | None]
 """Label, colour, quantity, and chaser or None."""
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot and its curves."""
+    """A plot and its curves. ``least``: with a logarithmic scale, the smallest value shown."""
 
     title: str
     curves: tuple[Curve, ...]
+    least: float | None = None
 
 
 def plots_of(
@@ -60,9 +66,9 @@ def plots_of(
     )
     return (
         Plot("distance to the target, m", each("distance_m")),
-        Plot("position error, mm", each("position_error_mm")),
-        Plot("orientation error, deg", each("orientation_error_deg")),
-        *((Plot("error of the target estimate", estimate),) if truth else ()),
+        Plot("position error, mm", each("position_error_mm"), _LEAST_ERROR),
+        Plot("orientation error, deg", each("orientation_error_deg"), _LEAST_ERROR),
+        *((Plot("error of the target estimate", estimate, _LEAST_ERROR),) if truth else ()),
         *((Plot("load at the port, N", each("port_load_N", ports)),) if truth and ports else ()),
         *((Plot("identified target, 1 sigma", uncertainty),) if identified else ()),
         Plot("solve time, ms", (("controller", QUANTITIES[0], "solve_ms", None),)),
@@ -71,8 +77,8 @@ def plots_of(
 
 
 def points_of(plot: Plot, history: History, begin_s: float, until_s: float) -> tuple[Array, ...]:
-    """Return times (K,) and the values (K,) of each curve, 2 <= K <= ``POINTS``; zeros without
-    data.
+    """Return times (K,) and the values (K,) of each curve, 2 <= K <= ``POINTS``; zeros, or
+    ``plot.least``, without data.
 
     Each value is the maximum of an equal time bin, so that peaks stay visible. A curve without a
     value in a bin of another curve keeps its previous value.
@@ -88,11 +94,15 @@ def points_of(plot: Plot, history: History, begin_s: float, until_s: float) -> t
         np.fmax.at(row, bins, values[inside])
     used = np.flatnonzero(~np.isnan(peaks).all(axis=0))
     if used.size == 0:
-        return tuple(np.zeros(2) for _ in range(len(series) + 1))
+        nothing = np.full(2, plot.least or 0.0)
+        return (np.zeros(2), *(nothing for _ in series))
     if used.size == 1:
         used = np.repeat(used, 2)
     centres = (edges[:-1] + edges[1:]) / 2.0
-    return (centres[used], *(_filled(row[used]) for row in peaks))
+    curves = (_filled(row[used]) for row in peaks)
+    if plot.least is not None:
+        curves = (np.maximum(curve, plot.least) for curve in curves)
+    return (centres[used], *curves)
 
 
 def _filled(values: Array) -> Array:

@@ -6,13 +6,14 @@ frustums.
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import trimesh
 import viser
 from chaserdock_models import rotations
-from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario import FlightScenario, Scenario
+from chaserdock_world.orbit import earth_disc, to_sun
 from chaserdock_world.rendering.background import star_field
 
 from chaserdock.analysis.scene import scene_of
@@ -22,6 +23,8 @@ from .history import History
 from .plots import COLOURS, ESTIMATE_COLOUR
 from .snapshot import MissionState, Pose, pose_of
 
+_IN_CORRIDOR = frozenset({"approach", "wait", "align", "final", "contact", "docked"})
+"""Phases in which a chaser's corridor is drawn."""
 ViewFrom = Literal["beside the target", "on the target", "the world"]
 VIEWS: tuple[ViewFrom, ...] = get_args(ViewFrom)
 """Frames that can be fixed on the screen: world axes at the target's position; target frame; world
@@ -32,8 +35,17 @@ TRAIL_S = 60.0
 """Time (s) of the path drawn behind each chaser. Larger: more of the manoeuvre, more crossing
 lines.
 """
-_VIEW_M = 0.22
-"""Length (m) of the drawn camera frustum; for display only, about the size of a chaser."""
+_VIEW_M = 0.1
+"""Size (m) of the drawn camera frustum; for display only, half a chaser. Larger: frustums hide the
+target.
+"""
+_FAINT = 0.55
+"""Brightness of frustums and corridors. Larger: they draw the eye from bodies and paths."""
+_REFERENCE_M, _REFERENCE_RAD = 0.02, math.radians(3.0)
+"""Distance (m) and angle (rad) of a chaser from its reference from which the reference is drawn:
+nearer ones lie inside the body.
+"""
+_RING_RGB = (96, 104, 116)
 _STARS_M = 100.0
 """Distance of the stars, m: far outside the scene."""
 _IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -41,6 +53,17 @@ _IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 def _rgb(colour: str) -> tuple[int, int, int]:
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def _faint(colour: tuple[int, int, int]) -> tuple[int, int, int]:
+    red, green, blue = (round(_FAINT * level) for level in colour)
+    return red, green, blue
+
+
+def _earth_disc(scenario: FlightScenario) -> tuple[tuple[float, float, float], float] | None:
+    """Return the Earth's disc as images show it. A flight scenario knows it by its orbit only."""
+    known = isinstance(scenario, Scenario) or scenario.orbit is not None
+    return earth_disc(cast("Scenario", scenario)) if known else None
 
 
 class SceneView:
@@ -51,11 +74,13 @@ class SceneView:
         self._scene = scene = server.scene
         scene.configure_default_lights(cast_shadow=False)
         self._root = scene.add_frame("/scene", show_axes=False)
+        self._reach_m = max(math.hypot(*c.position_m) for c in scenario.chasers)
         self._add_space()
+        self._add_scale()
 
         bodies = scene_of(scenario)
         self._target = self._body("/scene/target", shapes.mesh_of(bodies.target))
-        self._estimate = scene.add_frame("/scene/estimate", axes_length=0.25, axes_radius=0.003)
+        self._estimate = scene.add_frame("/scene/estimate", axes_length=0.15, axes_radius=0.002)
         size = scenario.target_model().size_m
         self._lines(
             "/scene/estimate/box", shapes.box_edges(size) * 1.02, _rgb(ESTIMATE_COLOUR), 2.0
@@ -71,7 +96,8 @@ class SceneView:
         self._plans: list[Any] = []
         self._references: list[Any] = []
         self._trails: list[Any] = []
-        self._corridors: list[Any] = []
+        self._corridors: dict[int, Any] = {}
+        self._corridors_shown = True
         self._frustums: list[Any] = []
 
         camera = scenario.camera_model()
@@ -89,9 +115,9 @@ class SceneView:
                     fov=2.0 * math.atan2(camera.height_px / 2.0, camera.fy_px),
                     aspect=camera.width_px / camera.height_px,
                     scale=_VIEW_M,
-                    thickness=1.5,
+                    thickness=1.0,
                     thickness_units="screen",
-                    color=colour,
+                    color=_faint(colour),
                     wxyz=np.asarray(camera.q_crf_irf_wxyz),
                     position=np.asarray(camera.position_crf_m),
                     cast_shadow=False,
@@ -99,7 +125,7 @@ class SceneView:
             )
 
             self._plans.append(
-                self._lines(f"/scene/plan_{i}", shapes.polyline(np.zeros((0, 3))), colour, 3.0)
+                self._lines(f"/scene/plan_{i}", shapes.polyline(np.zeros((0, 3))), colour, 2.0)
             )
             self._references.append(
                 scene.add_frame(
@@ -114,19 +140,28 @@ class SceneView:
 
             corridor = shapes.corridor_of(scenario, i)
             if corridor is not None:
-                self._corridors.append(
-                    self._lines(f"/scene/estimate/corridor_{i}", corridor, colour, 1.0)
+                self._corridors[i] = self._lines(
+                    f"/scene/estimate/corridor_{i}", corridor, _faint(colour), 1.0
                 )
 
         self.view: ViewFrom = VIEWS[0]
-        far = 2.0 * max(math.hypot(*c.position_m) for c in scenario.chasers)
+        far = 2.0 * self._reach_m
         server.initial_camera.position = (-0.55 * far, -0.85 * far, 0.55 * far)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
 
     def _add_space(self) -> None:
-        """Add the stars of the simulated images, on black whatever the theme of the page."""
+        """Add the stars and the Earth of the simulated images, on black whatever the theme of the
+        page.
+        """
         self._scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
         directions, levels = star_field()
+        if (disc := _earth_disc(self._scenario)) is not None:
+            towards, radius_rad = disc
+            axis = np.array(towards) / np.linalg.norm(towards)
+            sun = np.array(to_sun(cast("Scenario", self._scenario)))
+            self._body("/scene/earth", shapes.earth(axis, radius_rad, sun, self._reach_m))
+            beside = directions @ axis < math.cos(radius_rad)
+            directions, levels = directions[beside], levels[beside]
         self._scene.add_point_cloud(
             "/scene/stars",
             (_STARS_M * directions).astype(np.float32),
@@ -134,6 +169,20 @@ class SceneView:
             point_size=0.0015 * _STARS_M,
             point_shape="circle",
         )
+
+    def _add_scale(self) -> None:
+        """Add rings around the target, in the plane z = 0 of WRF, with their radii."""
+        self._rings = self._scene.add_frame("/scene/rings", show_axes=False)
+        for radius_m in shapes.scale_of(self._reach_m):
+            name = f"/scene/rings/{radius_m:g}"
+            self._lines(name, shapes.ring(radius_m), _RING_RGB, 1.0)
+            self._scene.add_label(
+                f"{name}/label", f"{radius_m:g} m", position=(0.0, -radius_m, 0.0)
+            )
+
+    def show_scale(self, shown: bool) -> None:
+        """Show or hide the rings."""
+        self._rings.visible = shown
 
     def _body(self, name: str, mesh: shapes.Mesh) -> Any:
         solid = trimesh.Trimesh(
@@ -151,9 +200,8 @@ class SceneView:
         )
 
     def show_corridors(self, shown: bool) -> None:
-        """Show or hide the corridors."""
-        for corridor in self._corridors:
-            corridor.visible = shown
+        """Show or hide the corridors of chasers that fly in one."""
+        self._corridors_shown = shown
 
     def show_keep_out(self, shown: bool) -> None:
         """Show or hide the keep-out sphere."""
@@ -170,15 +218,22 @@ class SceneView:
         shown = true or estimate
         self._place(self._target, shown)
         self._place(self._estimate, estimate)
+        if shown is not None:
+            self._rings.position = shown.position_m
         self._fix_frame(shown or _IDENTITY)
         keep_out_m = state.keep_out_m(self._scenario.limits.min_distance_target_m)
         if keep_out_m != self._keep_out_m:
             self._keep_out_m, self._keep_out.points = keep_out_m, shapes.sphere(keep_out_m)
         for i, chaser in enumerate(state.chasers):
             self._place(self._chasers[i], state.chaser(i))
-            self._place(
-                self._references[i], pose_of(chaser.reference) if chaser.reference else None
-            )
+            away = chaser.error()
+            apart = away is not None and (away[0] > _REFERENCE_M or away[1] > _REFERENCE_RAD)
+            reference = pose_of(chaser.reference) if chaser.reference and apart else None
+            self._place(self._references[i], reference)
+            if (corridor := self._corridors.get(i)) is not None:
+                in_it = chaser.reference is not None and chaser.reference.phase in _IN_CORRIDOR
+                if corridor.visible != (in_it and self._corridors_shown):
+                    corridor.visible = not corridor.visible
             if chaser.plan is not None:
                 self._plans[i].points = shapes.polyline(
                     np.reshape(chaser.plan.positions_m, (-1, 3))

@@ -10,28 +10,34 @@ import dataclasses
 import http
 import io
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import viser
 import websockets.asyncio.server
 from viser import _messages as viser_messages
 from websockets.asyncio.server import ServerConnection, serve
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from .address import ViewError, free_port, is_own_origin, path_below_token
 
 _RequestHandler = Callable[[ServerConnection, Request], Response | None]
+Documents = Mapping[str, Callable[[], tuple[http.HTTPStatus, str]]]
+"""Pages beside viser's by name: functions that return status and HTML at once."""
 
 
 @contextlib.contextmanager
-def page_server(host: str, port: int | None, token: str) -> Iterator[viser.ViserServer]:
+def page_server(
+    host: str, port: int | None, token: str, documents: Documents | None = None
+) -> Iterator[viser.ViserServer]:
     """Run a page server on ``host``, on ``port`` or the first free one from ``DEFAULT_PORT`` on.
     Raise ViewError.
 
-    ``token``: first path segment of the page and of its web socket, which is rejected without it.
+    ``token``: first path segment of the page, of its web socket and of the ``documents``, which are
+    rejected without it.
     """
-    server = _open(host, port, token)
+    server = _open(host, port, token, documents or {})
     try:
         yield server
     finally:
@@ -39,12 +45,12 @@ def page_server(host: str, port: int | None, token: str) -> Iterator[viser.Viser
             server.stop()
 
 
-def _open(host: str, port: int | None, token: str) -> viser.ViserServer:
+def _open(host: str, port: int | None, token: str, documents: Documents) -> viser.ViserServer:
     chosen = free_port(host, port)
     # Requests of other programs than a browser are not errors of this process.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     # Suppress viser's message on standard output.
-    with contextlib.redirect_stdout(io.StringIO()), _checked_requests(host, token):
+    with contextlib.redirect_stdout(io.StringIO()), _checked_requests(host, token, documents):
         server = viser.ViserServer(host=host, port=chosen, verbose=False)
     if server.get_port() != chosen:
         server.stop()
@@ -63,7 +69,7 @@ def _disable_sharing(server: viser.ViserServer) -> None:
 
 
 @contextlib.contextmanager
-def _checked_requests(host: str, token: str) -> Iterator[None]:
+def _checked_requests(host: str, token: str, documents: Documents) -> Iterator[None]:
     """Make a viser server that starts meanwhile check every request before it accepts a web socket.
 
     A browser lets any web site open a socket to this machine, which could then send commands. viser
@@ -73,7 +79,8 @@ def _checked_requests(host: str, token: str) -> Iterator[None]:
     """
 
     def serve_checked(*args: Any, process_request: _RequestHandler, **options: Any) -> serve:
-        return serve(*args, process_request=request_check(process_request, host, token), **options)
+        check = request_check(process_request, host, token, documents)
+        return serve(*args, process_request=check, **options)
 
     websockets.asyncio.server.serve = serve_checked
     try:
@@ -82,9 +89,20 @@ def _checked_requests(host: str, token: str) -> Iterator[None]:
         websockets.asyncio.server.serve = serve
 
 
-def request_check(respond: _RequestHandler, host: str, token: str) -> _RequestHandler:
+def _html(status: http.HTTPStatus, text: str) -> Response:
+    body = text.encode()
+    headers = Headers()
+    headers["Content-Type"] = "text/html; charset=utf-8"
+    headers["Content-Length"] = str(len(body))
+    headers["Cache-Control"] = "no-store"
+    return Response(status, status.phrase, headers, body)
+
+
+def request_check(
+    respond: _RequestHandler, host: str, token: str, documents: Documents
+) -> _RequestHandler:
     """Return ``respond`` restricted to requests with the token and, for web sockets, of the page's
-    own origin.
+    own origin; with the token, the ``documents``, too.
 
     ``respond`` returns None to accept a web socket. The files of viser's client are public.
     """
@@ -92,6 +110,9 @@ def request_check(respond: _RequestHandler, host: str, token: str) -> _RequestHa
     def check(connection: ServerConnection, request: Request) -> Response | None:
         path = path_below_token(request.path, token)
         response = respond(connection, dataclasses.replace(request, path=path or request.path))
+        name = (path or "").partition("?")[0].removeprefix("/")
+        if response is not None and name in documents:
+            return _html(*documents[name]())
         if response is None:
             origins = request.headers.get_all("Origin")
             if not is_own_origin(origins, request.headers.get_all("Host"), host):

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import centre_offset
@@ -19,6 +20,15 @@ _LAYER_M = 0.0004
 """Offset (m) of each painted layer above its face. Larger: layers visibly float; smaller: the depth
 buffer does not separate them.
 """
+_NEAREST_EARTH_M = 50.0
+"""Distance (m) of the drawn Earth's surface, in its true angular size. Larger: less parallax when
+the view is moved; smaller than the scene: chasers would fly through it.
+"""
+_CAP = (24, 72)
+"""Rings and sides of the drawn Earth. Larger: rounder limb, more triangles."""
+_SEA_RGB, _CLOUD_RGB = (38.0, 82.0, 150.0), (225.0, 232.0, 240.0)
+_NIGHT = 0.06
+"""Brightness of the Earth's night side, so that its disc is seen before black space."""
 _SIDES = 24
 """Sides of a polygon that stands for a circle; it deviates by 1 - cos(pi / 24) = 0.9 % of the
 radius.
@@ -111,6 +121,68 @@ def sphere(radius_m: float) -> NDArray[np.float32]:
         turn = np.array([-np.sin(longitude), np.cos(longitude)])
         circles.append(np.stack([flat[:, 0] * turn[0], flat[:, 0] * turn[1], flat[:, 1]], axis=1))
     return (radius_m * np.concatenate([polyline(c) for c in circles])).astype(np.float32)
+
+
+def ring(radius_m: float) -> NDArray[np.float32]:
+    """Return a circle about the origin in the plane z = 0 as segments (K, 2, 3)."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 4 * _SIDES + 1)
+    flat = [np.cos(angles), np.sin(angles), np.zeros_like(angles)]
+    return polyline(radius_m * np.stack(flat, axis=1))
+
+
+def scale_of(reach_m: float) -> tuple[float, float]:
+    """Return the radii of the two rings that show the scale: the largest of 1, 2, 5 times a power
+    of ten up to ``reach_m``, and half of it.
+    """
+    power = 10.0 ** np.floor(np.log10(reach_m * (1.0 + 1e-9)))
+    outer = float(max(n * power for n in (1.0, 2.0, 5.0) if n * power <= reach_m * (1.0 + 1e-9)))
+    return 0.5 * outer, outer
+
+
+def earth(direction: Array, radius_rad: float, to_sun: Array, reach_m: float) -> Mesh:
+    """Return the Earth as seen from the origin: the visible cap of a sphere with sea and clouds,
+    lit by the sun.
+
+    ``direction``, ``to_sun`` (3,): of any length. ``radius_rad``: angular radius of its disc.
+    ``reach_m``: size of the scene, outside which the cap lies.
+    """
+    axis = np.asarray(direction) / np.linalg.norm(direction)
+    east = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    east /= np.linalg.norm(east)
+    north = np.cross(axis, east)
+    nearest_m = max(_NEAREST_EARTH_M, 2.0 * reach_m)
+    distance_m = nearest_m / (1.0 - np.sin(radius_rad))
+    rings, sides = _CAP
+    # From below the viewer to the horizon, angles at the Earth's centre.
+    theta = np.linspace(0.0, 0.5 * np.pi - radius_rad, rings)[:, None, None]
+    phi = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)[None, :, None]
+    normals = -axis * np.cos(theta) + np.sin(theta) * (east * np.cos(phi) + north * np.sin(phi))
+    vertices = axis * distance_m + distance_m * np.sin(radius_rad) * normals
+
+    ring_of, side = np.meshgrid(np.arange(rings - 1), np.arange(sides), indexing="ij")
+    beside = (side + 1) % sides
+    a, b = ring_of * sides + side, ring_of * sides + beside
+    halves = np.stack([np.stack([a, b + sides, a + sides]), np.stack([a, b, b + sides])])
+    triangles = halves.transpose(0, 2, 3, 1).reshape(-1, 3)
+
+    noise = np.random.default_rng(0)
+    clouds = np.zeros((rings, sides))
+    for k in range(3):
+        clouds += 0.6**k * _stretched(noise.standard_normal((3 << k, 6 << k)), (rings, sides))
+    share = np.clip(0.35 + 0.35 * clouds, 0.0, 1.0)[..., None]
+    albedo = (1.0 - share) * np.array(_SEA_RGB) + share * np.array(_CLOUD_RGB)
+    sun = np.asarray(to_sun) / np.linalg.norm(to_sun)
+    colours = albedo * np.maximum(_NIGHT, normals @ sun)[..., None]
+    return Mesh(
+        vertices.reshape(-1, 3), triangles.astype(np.int32), colours.reshape(-1, 3).astype(np.uint8)
+    )
+
+
+def _stretched(coarse: Array, size: tuple[int, int]) -> Array:
+    """Return noise (rows, columns) interpolated to ``size``, continuous across its last column."""
+    wrapped = np.concatenate([coarse, coarse[:, :1]], axis=1)
+    whole = cv2.resize(wrapped, (size[1] + 1, size[0]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(whole[:, :-1], dtype=float)
 
 
 def corridor_of(scenario: FlightScenario, chaser: int) -> NDArray[np.float32] | None:

@@ -47,6 +47,8 @@ OF_CHASERS = (
     topics.PLAN,
     topics.SAFETY,
 )
+EVENT_TOPICS = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
+"""Topics of the list of events, and of its counts."""
 OF_ALL = (topics.TICK, topics.TARGET, topics.STACK, topics.SOLVER, topics.END)
 """Topics of the state: of each chaser (OF_CHASERS), of the mission (OF_ALL). Within a tick their
 order is causal.
@@ -63,6 +65,10 @@ smaller: late cameras are missed.
 _RECENT_NS = 2_000_000_000
 """Age (ns) after which a chaser's images count as stopped. Larger: the others wait longer for
 it.
+"""
+OLD_S = 1.0
+"""Age (s) above which an image is shown as old, and up to which exposures are compared to show all
+cameras at one moment. Larger: old images pass for present ones.
 """
 _FIELDS = {
     Odometry: "odometry",
@@ -132,6 +138,11 @@ class ChaserState:
         distance_m = float(np.linalg.norm(np.subtract(odometry.position_m, reference.position_m)))
         return distance_m, float(rotations.angle_between(reference.q_wxyz, odometry.q_wxyz))
 
+    def latest_seen(self, now_ns: int) -> Image | None:
+        """Return the latest image whose sighting has been received, not older than ``OLD_S``."""
+        seen = [t for t in self.images if t in self._sightings and t >= now_ns - OLD_S * 1e9]
+        return self.images[max(seen)] if seen else None
+
     def sighting_in(self, image: Image) -> Sighting | None:
         """Return the sighting of that image, if received."""
         return self._sightings.get(image.sim_time_ns)
@@ -193,8 +204,8 @@ class MissionState:
         """Return an image of each chaser from the same exposure: the newest of which all images
         and, if possible, all sightings have arrived.
 
-        Without such an exposure, and for a chaser whose images have stopped, it is the latest
-        image.
+        Without such an exposure within ``OLD_S``, and for a chaser whose images have stopped, it
+        is the latest image; if possible, the latest with a sighting.
         """
         images = [c.image for c in self.chasers]
         newest_ns = max((image.sim_time_ns for image in images if image is not None), default=0)
@@ -204,9 +215,10 @@ class MissionState:
             if c.image is not None and c.image.sim_time_ns >= newest_ns - _RECENT_NS
         ]
         common = set[int].intersection(*(set(c.images) for c in present)) if present else set[int]()
+        common = {t for t in common if t >= newest_ns - OLD_S * 1e9}
         seen = {t for t in common if all(c.sighting_in(c.images[t]) is not None for c in present)}
         if not common:
-            return images
+            return [c.latest_seen(newest_ns) or c.image for c in self.chasers]
         moment_ns = max(seen or common)
         return [c.images.get(moment_ns, c.image) for c in self.chasers]
 

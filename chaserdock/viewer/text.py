@@ -15,8 +15,8 @@ from chaserdock.verdict import Verdict
 from .history import History, Line
 from .snapshot import ChaserState, MissionState
 
-_MARKS = {"info": "", "warning": "⚠ ", "error": "⛔ "}
-_VERDICT_MARKS = {"good": "✓ ", "partial": "⚠ ", "bad": "⛔ "}
+_MARKS = {"info": "", "warning": "⚠ ", "error": "✗ "}
+_VERDICT_MARKS = {"good": "✓ ", "partial": "⚠ ", "bad": "✗ "}
 _FRESH_S = 2.0
 """Age (s) up to which a latency is shown: that of stopped images is out of date."""
 _GOOD_SOLVES = frozenset({"solved", "iteration_limit"})
@@ -28,8 +28,11 @@ def head(
     mode: str,
     speed: float | None,
     verdict: Verdict | None = None,
+    report: str | None = None,
 ) -> str:
-    """Return time, speed, estimator status, how the mission ended and, for a log, the verdict."""
+    """Return time, speed, estimator status, how the mission ended and, for a log, the verdict and
+    a link to the ``report``.
+    """
     lines = [
         f"**{scenario.name}** · {mode}",
         f"**{state.time_s():.1f} s** of {scenario.duration_s:g} s",
@@ -45,11 +48,15 @@ def head(
     if verdict is not None:
         lines.append(f"{_VERDICT_MARKS[verdict.level]}**verdict: {verdict.headline}**")
         lines += verdict.lines_beside_table()
+    elif report is not None:
+        lines.append("the log is being judged")
     elif state.ended is not None:
         lines.append(
-            f"{'ended' if state.ended.complete else '⛔ ended early'}: {state.ended.reason}"
+            f"{'ended' if state.ended.complete else '✗ ended early'}: {state.ended.reason}"
         )
         lines.append("the verdict needs the log: `chaserdock judge`")
+    if report is not None:
+        lines.append(f'<a href="{report}" target="_blank">report</a>')
     rows = "" if verdict is None else markdown_table(verdict.criteria)
     return "  \n".join(lines) + (f"\n\n{rows}" if rows else "")
 
@@ -150,9 +157,9 @@ def _chaser_faults(i: int, chaser: ChaserState) -> list[str]:
     return out
 
 
-def events(lines: list[Line], most: int = 99) -> str:
+def events(lines: list[Line], most: int = 99, begins_s: float = 0.0) -> str:
     """Return at most ``most`` event lines, newest first. Lines that differ in numbers only are
-    merged and counted.
+    merged and counted. ``begins_s``: time from which events are known.
     """
     groups: dict[tuple[str, str], list[Line]] = {}
     for line in lines:
@@ -164,4 +171,6 @@ def events(lines: list[Line], most: int = 99) -> str:
         newest = group[0]
         times = f" ({len(group)} times since {group[-1].time_s:.2f} s)" if len(group) > 1 else ""
         out.append(f"- `{newest.time_s:7.2f} s` {_MARKS[newest.level]}{newest.text}{times}")
+    if begins_s > 0.0:
+        out.append(f"- those before {begins_s:.1f} s, when this page joined, are in the log")
     return "\n".join(out) or "none"

@@ -16,10 +16,15 @@ from types import ModuleType
 from typing import Any
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
+from chaserdock_controller.guidance.phases import TRANSITIONS
 from chaserdock_protocol.scenario import parse_scenario
 from harness import ROOT
 from source_tree import MODULES
+
+from chaserdock.experiments.reproduction import curves
+from chaserdock.experiments.reproduction.paper import ROWS
 
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
@@ -47,12 +52,15 @@ def _module(name: str) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # for its dataclasses
     spec.loader.exec_module(module)
     return module
 
 
 make_site: Any = _module("make_site")
 make_api: Any = _module("make_api")
+make_images: Any = _module("make_images")
+make_phases: Any = _module("make_phases")
 
 
 class Requests(HTMLParser):
@@ -189,6 +197,57 @@ def test_a_link_to_nowhere_is_an_error(tmp_path: Path) -> None:
         "[there](source/examples/README.md)"
     )
     assert (tmp_path / "stage" / "source" / "examples" / "README.md").is_file()
+
+
+def test_a_diagram_that_would_be_shown_as_its_source_text_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(make_site, "ROOT", tmp_path)
+    monkeypatch.setattr(make_site, "DOCS", tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text("# Page\n\n```mermaid\nstateDiagram-v2\n```\n", encoding="utf-8")
+    stage = make_site.Stage(tmp_path / "stage")
+    with pytest.raises(make_site.SiteError, match=r"page\.md: ```mermaid would be shown as its"):
+        stage.add(page)
+
+
+@pytest.mark.parametrize("by_capture", [False, True])
+def test_phase_diagrams_show_every_transition(by_capture: bool) -> None:
+    """As an arrow of its own, or beside its target with its sources or their number."""
+    several, single = make_phases.triggers(by_capture)
+    shown = {t for t in TRANSITIONS if t.by_capture in (None, by_capture)}
+    drawn = {(target, line) for target, lines in several.items() for line in lines}
+    for t in shown:
+        beside = any(target == t.target and line.startswith(t.trigger) for target, line in drawn)
+        alone = all(t.trigger in single.get((s, t.target), "") for s in t.sources)
+        assert beside or alone, t
+    phases = {p for t in shown for p in (*t.sources, t.target)}
+    assert phases <= make_phases._AT[by_capture].keys()
+    assert several.keys() <= make_phases._BESIDE[by_capture].keys()
+
+
+def test_curves_of_the_reproduction_are_those_of_its_tables(tmp_path: Path) -> None:
+    """The committed picture is drawn from the committed page; the page shows it."""
+    text = (DOCS / "reproduction.md").read_text(encoding="utf-8")
+    assert "](images/reproduction-curves.svg)" in text
+    tables = make_images.tables_of_reproduction(text)
+    ours = curves.ratios(tables, "position", "ours")
+    assert ours.keys() == {row.label for row in ROWS}
+    axes = curves.curves(tables).axes
+    assert len(axes) == 6
+    drawn = {line.get_label(): np.asarray(line.get_xydata()) for line in axes[0].get_lines()}
+    expected = [
+        (r.horizon_s, ours[r.label] * r.position_mse_m2) for r in curves.varied("horizon_s")
+    ]
+    assert drawn["ours"].tolist() == [pytest.approx(point) for point in expected]
+    assert [r.horizon_s for r in curves.varied("horizon_s")] == [0.5, 3.0, 10.0]
+
+
+def test_pictures_are_small() -> None:
+    """Of a film, 1.3 MB."""
+    films = {"four-chaser-docking.webp", "markerless-docking.webp"}
+    large = {p.name for p in (DOCS / "images").iterdir() if p.stat().st_size > 150_000}
+    assert large <= films
 
 
 def test_navigation_names_pages_that_are_there(tmp_path: Path) -> None:

@@ -490,7 +490,7 @@ def test_page_of_a_complete_plan_has_all_rows_and_its_provenance() -> None:
     checker = _Checker()
     checker.feed(html("t", parts))
     assert checker.open == []
-    assert checker.links == []
+    assert [link for link in checker.links if not link.startswith("#")] == []
 
 
 def test_page_reports_missing_results() -> None:

@@ -54,9 +54,11 @@ from chaserdock.viewer.address import (
     url_of,
 )
 from chaserdock.viewer.history import History, Line, Series
+from chaserdock.viewer.live import past_lines
 from chaserdock.viewer.logged import LoggedMission
-from chaserdock.viewer.page import Timeline
+from chaserdock.viewer.page import Timeline, with_age
 from chaserdock.viewer.player import advance
+from chaserdock.viewer.report_page import ReportPage
 from chaserdock.viewer.server import page_server
 from chaserdock.viewer.snapshot import MissionState
 
@@ -143,6 +145,13 @@ def test_images_are_of_one_moment() -> None:
         image(0, time_s)
         image(1, time_s)
     assert shown() == [4.5, 4.5, 2.0]
+    # A slow page takes one image of each chaser in turn: an exposure that all have may be long ago.
+    image(2, 4.5)
+    for k in range(3):
+        image(k, 6.0 + 0.1 * k)
+    assert shown() == [6.0, 6.1, 6.2]
+    image(0, 6.3, seen=False)
+    assert shown() == [6.0, 6.1, 6.2]
     assert MissionState.empty(1).images_of_one_moment() == [None]
 
 
@@ -217,6 +226,42 @@ def test_plot_without_data_can_be_drawn() -> None:
     for plot in plots.plots_of(3, True):
         points = plots.points_of(plot, History(3), 0.0, 10.0)
         assert [len(p) for p in points] == [2] * (len(plot.curves) + 1)
+        assert plot.least is None or min(map(min, points[1:])) > 0.0  # has a logarithm
+
+
+def test_a_millimetre_shows_beside_a_start_from_afar() -> None:
+    """The scale of the position error is logarithmic: a tick without error does not break it."""
+    history = History(1)
+    for time_s, error_mm in ((1.0, 400.0), (2.0, 1.0), (3.0, 0.0)):
+        history.series["position_error_mm", 0].add(time_s, error_mm)
+    plot = next(p for p in plots.plots_of(1, False) if p.curves[0][2] == "position_error_mm")
+    assert plot.least is not None
+    values = plots.points_of(plot, history, 0.0, 4.0)[1]
+    assert values.tolist() == [400.0, 1.0, plot.least]
+
+
+def test_an_old_image_says_how_old_it_is() -> None:
+    """It is dimmed, and its lower edge bears the age in the colour of warnings."""
+    old = with_age(np.full((120, 200, 3), 200, np.uint8), 3.2)
+    assert old[:60].max() == 100
+    lettered = (old[60:] == (255, 176, 0)).all(axis=2)
+    assert lettered.sum() > 50
+
+
+def test_events_before_the_viewer_joined_are_added_from_the_log(mission: LoggedMission) -> None:
+    """From a log that is being written, as soon as it reaches the tick at which it joined."""
+    late = History(2)
+    late.begins_s = 1.0
+    late.add_line(1.1, "info", "a later one")
+    assert past_lines(GOLDEN, 2, 1e3) is None
+    assert "those before 1.0 s" in words.events(late.lines_until(9.0, 9), 9, late.begins_s)
+    for _ in range(2):  # what is known is not repeated
+        late.add_past(past_lines(GOLDEN, 2, 1.0) or [])
+    listed = words.events(late.lines_until(9.0, 99), 99, late.begins_s)
+    assert "approach chaser 0: accepted" in listed
+    assert listed.count("a later one") == 1
+    assert len(late.lines) == 1 + len(mission.history.lines_until(1.0, 99))
+    assert "before" not in listed
 
 
 def test_events_are_listed_newest_first_without_repetition() -> None:
@@ -370,6 +415,29 @@ def test_mesh_normals_point_outwards(name: str) -> None:
     assert np.all(np.einsum("ij,ij->i", normals, np.repeat(quads, 2, axis=0)) > 0.0)
 
 
+def test_scale_is_a_round_number_within_the_scene() -> None:
+    assert shapes.scale_of(1.0) == (0.5, 1.0)
+    assert shapes.scale_of(0.85) == (0.25, 0.5)
+    assert shapes.scale_of(950.0) == (250.0, 500.0)
+    assert np.linalg.norm(shapes.ring(0.5), axis=2) == pytest.approx(0.5)
+
+
+def test_the_earth_fills_its_disc_outside_the_scene() -> None:
+    """Seen from the scene's middle it has the angular radius of the images, is lit where the sun
+    is, and its triangles face the viewer.
+    """
+    axis, radius_rad, reach_m = np.array([0.0, 0.6, -0.8]), 1.1, 40.0
+    mesh = shapes.earth(3.0 * axis, radius_rad, -axis, reach_m)
+    rays = mesh.vertices_m / np.linalg.norm(mesh.vertices_m, axis=1, keepdims=True)
+    assert np.arccos(rays @ axis).max() == pytest.approx(radius_rad)
+    assert np.linalg.norm(mesh.vertices_m, axis=1).min() == pytest.approx(2.0 * reach_m)
+    three = mesh.vertices_m[mesh.triangles]
+    normals = np.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
+    assert np.all(np.einsum("ij,ij->i", normals, three[:, 0]) <= 1e-9)
+    night = shapes.earth(axis, radius_rad, axis, reach_m)
+    assert mesh.colours.mean() > 5.0 * night.colours.mean() > 0.0
+
+
 def test_corridor_covers_the_allowed_region() -> None:
     held = load_scenario(ROOT / "scenarios" / "four-chaser-docking.toml")
     line = shapes.corridor_of(held, 0)
@@ -497,6 +565,28 @@ def test_page_is_served_below_its_token_only() -> None:
             urllib.request.urlopen(f"{address(server)}/?darkMode")
         assert b"open the one that chaserdock has printed" in rejected.value.read()
         rejected.value.close()
+
+
+def test_report_is_made_when_it_is_asked_for_and_served_below_the_token() -> None:
+    """Until it is ready, a page that asks again stands for it."""
+    report = ReportPage()
+    assert report()[0] == 404
+    report.log = GOLDEN
+    with page_server("127.0.0.1", None, TOKEN, {"report.html": report}) as server:
+        with pytest.raises(urllib.error.HTTPError, match="404") as rejected:
+            urllib.request.urlopen(f"{address(server)}/report.html")
+        rejected.value.close()
+        with urllib.request.urlopen(f"{address(server)}/{TOKEN}/report.html") as response:
+            assert b'http-equiv="refresh"' in response.read()
+        report.wait()
+        with urllib.request.urlopen(f"{address(server)}/{TOKEN}/report.html") as response:
+            page = response.read().decode()
+    assert 'http-equiv="refresh"' not in page
+    assert 'id="figures"' in page
+    broken = ReportPage(GOLDEN.with_name("none.mcap"))
+    broken()
+    broken.wait()
+    assert broken()[0] == 500
 
 
 def test_token_is_random_or_that_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

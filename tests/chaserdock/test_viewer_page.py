@@ -8,11 +8,14 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
+import cv2
+import numpy as np
 import psutil
 import pytest
 from browser import chromium, freeze, open_page, why_no_browser
@@ -24,6 +27,12 @@ from playwright.sync_api import Page
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.launch.launcher import free_port
+from chaserdock.launch.mission_address import (
+    ADDRESS_FILE,
+    MissionAddress,
+    remove_address,
+    write_address,
+)
 
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
 needs_browser = pytest.mark.skipif(bool(why_no_browser()), reason=why_no_browser())
@@ -89,6 +98,45 @@ def test_page_of_a_log_makes_no_external_requests() -> None:
     assert errors == []
 
 
+@needs_browser
+def test_on_a_phone_the_panel_is_below_the_scene() -> None:
+    """Its upper edge is the lower one of the scene, whose middle is the target."""
+    with viewer(str(GOLDEN), "--at", "1.0") as url, chromium() as browser:
+        page = open_page(browser, url, 390, 844)
+        wait_for(page, "verdict: ")
+        scene = page.locator("canvas[data-engine]").bounding_box()
+        panel = page.locator(".mantine-Paper-root", has_text="Time line").first.bounding_box()
+        assert scene is not None
+        assert panel is not None
+        assert scene["y"] + scene["height"] <= panel["y"] + 1.0
+        assert scene["height"] > 0.4 * 844
+        assert (panel["x"], panel["width"]) == (0.0, 390.0)
+        page.set_viewport_size({"width": 1280, "height": 800})
+        page.locator("text=Plots").first.wait_for()
+        beside = page.locator("canvas[data-engine]").bounding_box()
+        assert beside is not None
+        assert beside["width"] > 500.0
+
+
+@needs_browser
+@pytest.mark.slow
+def test_pictures_of_the_viewer_are_made_of_today_s_page(tmp_path: Path) -> None:
+    """By the script, of which docs/viewer.md shows every picture."""
+    script = ROOT / "docs" / "make_viewer_images.py"
+    command = [sys.executable, str(script), str(tmp_path), "--log", str(GOLDEN), "--at", "1.0"]
+    subprocess.run(command, check=True, timeout=LONG_S)
+    page = (ROOT / "docs" / "viewer.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"\]\(images/(viewer-\w+\.webp)\)", page))
+    assert {file.name for file in tmp_path.iterdir()} == shown
+    sizes = {}
+    for name in shown:
+        image = np.asarray(cv2.imread(str(tmp_path / name)))
+        sizes[name] = image.shape[1::-1]
+        assert image.std() > 10.0
+    assert sizes["viewer-phone.webp"] == (390, 844)
+    assert sizes["viewer-log.webp"] == (1280, 800)
+
+
 # -- a running mission -----------------------------------------------------------------------------
 
 
@@ -110,9 +158,54 @@ def hand() -> Iterator[ByHand]:
 @needs_browser
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_scene_moves_and_click_starts_docking(hand: ByHand, tmp_path: Path) -> None:
-    with viewer("-e", hand.endpoint, "--namespace", "seen") as url, chromium() as browser:
+def test_after_the_flight_the_page_shows_verdict_report_and_time_line(
+    hand: ByHand, tmp_path: Path
+) -> None:
+    """As with ``run --view``: once the folder holds no address any more, its log is complete."""
+    address = MissionAddress(namespace="seen", endpoint=hand.endpoint)
+    write_address(tmp_path, address)
+    with viewer("--run", str(tmp_path)) as url, chromium() as browser:
         page = open_page(browser, url)
+        wait_for(page, "no mission is running")
+        start_flight(hand, tmp_path, "lockstep", *SHORT, "duration_s=3.0")
+        hand.start("controller", "controller")
+        wait_for(page, "target: tracking")
+        hand.output_of("recorder", LONG_S)
+        remove_address(tmp_path)
+        wait_for(page, "verdict: ")
+        for text in ("ended: completed at 3.00 s", "between chasers", "initialised by chaser"):
+            wait_for(page, text)
+        assert page.get_by_role("button", name="approach").count() == 0
+        page.get_by_role("button", name="to start").click()
+        wait_for(page, r"0\.\d s of|0\.\d s")
+        with page.context.expect_page() as opened:
+            page.get_by_role("link", name="report").click()
+        opened.value.get_by_role("heading", name="Figures").wait_for(timeout=LONG_S * 1e3)
+
+
+@pytest.mark.slow
+def test_run_with_a_viewer_that_nobody_watches_ends_after_the_flight(tmp_path: Path) -> None:
+    short = ("two-chaser-tracking", *sets(*SHORT, "duration_s=1.0", "settling_s=0.5"))
+    out = ("--out", str(tmp_path / "run"))
+    process = chaserdock("run", *short, *out, "--view", stderr=subprocess.STDOUT)
+    process.wait(timeout=LONG_S)
+    assert (tmp_path / "run" / "summary.json").is_file()
+    assert not (tmp_path / "run" / ADDRESS_FILE).exists()
+
+
+TWO_FRAMES = """
+window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 500);
+window.cancelAnimationFrame = clearTimeout;"""
+"""A browser that draws two frames a second, as one without a GPU does on a loaded machine."""
+
+
+@needs_browser
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("script", ["", TWO_FRAMES], ids=["drawing", "two-frames"])
+def test_scene_moves_and_click_starts_docking(hand: ByHand, tmp_path: Path, script: str) -> None:
+    with viewer("-e", hand.endpoint, "--namespace", "seen") as url, chromium() as browser:
+        page = open_page(browser, url, script=script)
         wait_for(page, "no mission is running")
         start_flight(hand, tmp_path, "lockstep", *SHORT, "duration_s=3600.0")
         hand.start("controller", "controller")

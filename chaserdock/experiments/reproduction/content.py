@@ -16,6 +16,7 @@ from chaserdock_protocol.scenario.bodies import Target
 from chaserdock.experiments.page import PageSection, Table
 from chaserdock.experiments.plan import ExperimentPlan
 
+from .curves import curves_section
 from .earlier import NO_PAGE, EarlierPage
 from .flown import Provenances, flights_section
 from .headline import Tables, free_section, result_section
@@ -77,6 +78,7 @@ def sections(
     trends = _trends(results, earlier)
     return [
         result_section(results, tables, trends, (missing, len(plan.flights)), quick, earlier),
+        curves_section(tables),
         PageSection("Trends", (_TRENDS_TEXT, trends)),
         free_section(results),
         *(PageSection(f"Table: {q}", (_table_text(), tables[q])) for q in QUANTITIES),

@@ -11,7 +11,7 @@ from chaserdock_protocol.errors import errors_of_writing
 from chaserdock_protocol.output_files import write_atomically
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
-from chaserdock.experiments.page import html, markdown
+from chaserdock.experiments.page import Picture, html, markdown
 from chaserdock.experiments.plan import ExperimentError, ExperimentPlan
 from chaserdock.experiments.worker import ExperimentProgress, Workers, fly_plan
 from chaserdock.launch.signals import stop_on_signals
@@ -62,10 +62,13 @@ def fly_and_report(
             outcomes = fly_plan(flyable, out, Workers(jobs), ExperimentProgress(), stop)
         results, flown = results_by_label(plan, outcomes), flown_by_label(plan, outcomes)
         parts = sections(plan, results, flown, quick, earlier)
+        pictures = [p for section in parts for p in section.parts if isinstance(p, Picture)]
         for name, text in (
+            *((picture.path, picture.file) for picture in pictures),
             ("reproduction.md", markdown(TITLE, parts)),
             ("reproduction.html", html(TITLE, parts)),
         ):
+            (out / name).parent.mkdir(exist_ok=True)
             write_atomically(out / name, text)
             _report(f"wrote {out / name}")
     if stop.is_set():

@@ -5,24 +5,27 @@ foil, as for the simulated cameras, once for each of three colours.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import cv2
 import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_models.meshes import TriangleMesh
 from chaserdock_models.targets import Box
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.orbit import earth_disc, to_sun
-from chaserdock_world.rendering.background import SPACE_LEVEL, Background, Earth, Light
+from chaserdock_world.rendering.background import SPACE_LEVEL, WHITE_LEVEL, Background, Earth, Light
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer
+from chaserdock_world.rendering.scene_geometry import Obstacle
 from numpy.typing import NDArray
 
 from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint, tint
-from .film_bodies import chaser_body, target_body
+from .film_bodies import Body, chaser_body, target_body
 
-_AMBIENT = 0.22
+AMBIENT = 0.22
 """Share of ambient light: less than in the cameras' images, so that shadows are dark, but the
 shaded side is visible."""
-_GAMMA = 0.6
+GAMMA = 0.6
 """Exponent of the grey levels for display, as in snapshots."""
 _SEA = (2.6, 1.25, 0.55)
 """Colour (blue, green, red) of dark parts of the Earth relative to grey: the sea under air."""
@@ -36,25 +39,19 @@ class BodyRenderer:
     def __init__(self, scenario: Scenario, chasers: tuple[int, ...], look: Viewpoint) -> None:
         disc, camera = earth_disc(scenario), look.pinhole()
         earth = None if disc is None else Earth(*disc)
-        x, y, z = to_sun(scenario)
-        self._light = Light((x, y, z), 1.0 - _AMBIENT, _AMBIENT)
+        self._light = light_of(scenario)
         # A cuboid of its own stands for each chaser's mesh.
         self._places = {i: (Box((1.0 + i, 1.0, 1.0)),) for i in chasers}
         target = target_body(scenario)
         bodies = {i: chaser_body(scenario, i, reflectance(i)) for i in chasers}
-        self._channels = [
-            MeshRenderer(
-                camera,
-                target.mesh(channel),
-                substitutes={self._places[i][0]: bodies[i].mesh(channel) for i in chasers},
-            )
-            for channel in (2, 1, 0)
-        ]
-        self._space = Background(camera, np.zeros(2), (look.width_px, look.height_px), earth)
 
-    def background(self, look: Viewpoint) -> BgrImage:
-        """Return stars and coloured Earth, before the display's exponent."""
-        return coloured_space(self._space.draw(look.attitude(), self._light))
+        def renderer(mesh_of: Callable[[Body], TriangleMesh]) -> MeshRenderer:
+            chosen = {self._places[i][0]: mesh_of(bodies[i]) for i in chasers}
+            return MeshRenderer(camera, mesh_of(target), substitutes=chosen)
+
+        self._channels = [renderer(lambda b, k=k: b.mesh(k)) for k in (2, 1, 0)]
+        self._white = renderer(lambda b: b.white())
+        self._space = Background(camera, np.zeros(2), (look.width_px, look.height_px), earth)
 
     def render(
         self, look: Viewpoint, target: BodyPose, chasers: Mapping[int, BodyPose]
@@ -62,18 +59,31 @@ class BodyRenderer:
         """Render the bodies at their poses over stars and Earth."""
         eye, attitude = look.eye_m, look.attitude()
         obstacles = [(self._places[i], *pose) for i, pose in chasers.items()]
-        layers = [
-            renderer.render(eye, attitude, *target, obstacles, self._light)
-            for renderer in self._channels
-        ]
-        bodies, space = np.stack(layers, axis=2), self._space.draw(attitude, self._light)
-        empty = self._channels[0].render(
-            eye, attitude, (0.0, 0.0, 1e6), (1.0, 0.0, 0.0, 0.0), (), self._light
-        )
-        covered = np.any(bodies != empty[:, :, None], axis=2)
-        behind = shown(coloured_space(space))
-        bgr = np.where(covered[:, :, None], shown(bodies), behind)
-        return RenderedBodies(behind, np.asarray(bgr, np.uint8), covered)
+        cover = self._cover(eye, attitude, target, obstacles)
+        layers = [renderer.render(eye, attitude, *target, obstacles, self._light)
+                  for renderer in self._channels]  # fmt: skip
+        space = coloured_space(self._space.draw(attitude, self._light))
+        mixed = cover * np.stack(layers, axis=2) + (1.0 - cover) * space
+        return RenderedBodies(shown(space), shown(mixed.astype(np.uint8)), cover[:, :, 0] > 0.0)
+
+    def _cover(
+        self, eye: Array, attitude: Array, target: BodyPose, obstacles: Sequence[Obstacle]
+    ) -> NDArray[np.float32]:
+        """Return the share (h, w, 1) of each pixel that bodies cover: what is brighter than space,
+        stars apart, if bodies are white and lit from all sides.
+        """
+        nothing = (np.array([0.0, 0.0, 1e6]), np.array([1.0, 0.0, 0.0, 0.0]))
+        even = Light(sun=0.0, ambient=1.0)
+        white = self._white.render(eye, attitude, *target, obstacles, even).astype(np.float32)
+        empty = self._white.render(eye, attitude, *nothing, (), even).astype(np.float32)
+        share = (white - empty) / np.maximum(WHITE_LEVEL - empty, 1.0)
+        return np.clip(share, 0.0, 1.0)[:, :, None]
+
+
+def light_of(scenario: Scenario) -> Light:
+    """Return the sun and the ambient light of films."""
+    x, y, z = to_sun(scenario)
+    return Light((x, y, z), 1.0 - AMBIENT, AMBIENT)
 
 
 def reflectance(chaser: int) -> tuple[float, float, float]:
@@ -92,5 +102,5 @@ def coloured_space(grey: NDArray[np.uint8]) -> BgrImage:
 
 def shown(bgr: NDArray[np.uint8]) -> BgrImage:
     """Return an image with the exponent for display applied."""
-    levels = np.array([255.0 * (v / 255.0) ** _GAMMA for v in range(256)]).astype(np.uint8)
+    levels = np.array([255.0 * (v / 255.0) ** GAMMA for v in range(256)]).astype(np.uint8)
     return np.asarray(cv2.LUT(bgr, levels), np.uint8)

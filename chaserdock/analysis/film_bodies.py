@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, Vector3
-from chaserdock_models.meshes import Material, MeshPart, TriangleMesh, moved
+from chaserdock_models.meshes import Material, MeshPart, Texture, TriangleMesh, moved
 from chaserdock_models.satellites import box, lathe, satellite
 from chaserdock_models.targets import Box, TargetModel, face_extent, face_rotation
 from chaserdock_protocol.scenario import FlightScenario
@@ -52,7 +52,7 @@ class Coat:
     rgb: Rgb
     specular: Rgb = (0.0, 0.0, 0.0)
     exponent: float = 20.0
-    texture: str = ""
+    texture: Texture = ""
     metal: bool = False
 
 
@@ -109,20 +109,17 @@ class Body:
 
     def mesh(self, channel: int) -> TriangleMesh:
         """Return the body as one colour channel sees it: 0 red, 1 green, 2 blue."""
-        parts = [
-            replace(
-                part,
-                material=Material(
-                    coat.texture or "coat",
-                    coat.rgb[channel],
-                    coat.specular[channel],
-                    coat.exponent,
-                    "insulation" if coat.texture == "insulation"
-                    else "cells" if coat.texture == "cells" else "",
-                ),
+        parts = []
+        for part, coat in self.parts:
+            surface = Material(
+                "coat", coat.rgb[channel], coat.specular[channel], coat.exponent, coat.texture
             )
-            for part, coat in self.parts
-        ]  # fmt: skip
+            parts.append(replace(part, material=surface))
+        return TriangleMesh("film", tuple(parts), {})
+
+    def white(self) -> TriangleMesh:
+        """Return the body all white, which shows what it covers."""
+        parts = [replace(part, material=Material("white", 1.0)) for part, _ in self.parts]
         return TriangleMesh("film", tuple(parts), {})
 
 

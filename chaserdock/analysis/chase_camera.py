@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""External view of a mission, drawn with OpenCV: rendered bodies, or flat faces in order of depth
-(painter's algorithm).
-"""
+"""External view of a mission: the viewpoint, and what is drawn around the rendered bodies."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -16,8 +14,9 @@ from chaserdock_models.camera import Camera
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
+from .motion import Track
 from .plots import colour
-from .scene import Face, Scene
+from .scene import Scene
 
 BgrImage = NDArray[np.uint8]
 BodyPose = tuple[Array, Array]
@@ -28,13 +27,11 @@ _NEAR_M = 0.02
 _SHIFT = 4
 """Bits of OpenCV's fixed-point coordinates behind the point: 1/16 px, finer than antialiasing
 shows."""
-_SPACE = (26, 21, 18)
-"""Colour (BGR, 0 to 255) of space without a background: almost black, so that dark bodies stand
-out.
-"""
 _TARGET_PATH = (150, 150, 150)
 """Colour (BGR, 0 to 255) of the target's path: grey, because chasers are coloured."""
-_PLUME = np.array([255.0, 214.0, 150.0])
+_PLUME = np.array([255.0, 226.0, 190.0])
+_PLUME_SHARE = 0.3
+"""Opacity of each of the four layers of a plume."""
 
 
 def tint(chaser: int) -> Array:
@@ -47,10 +44,10 @@ def tint(chaser: int) -> Array:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera that looks at a point ``centre_m`` (3,), WRF, in the middle of the image.
+    """A camera that looks at a point ``centre_m`` (3,), WRF.
 
     ``distance_m``, ``azimuth_rad``, ``elevation_rad``: position of the camera from that point, in
-    WRF.
+    WRF. ``middle_px``: where the point is seen; the middle of the image without it.
     """
 
     centre_m: Array
@@ -59,6 +56,17 @@ class Viewpoint:
     elevation_rad: float
     width_px: int
     height_px: int
+    middle_px: tuple[float, float] | None = None
+
+    @property
+    def eye_m(self) -> Array:
+        """Position (3,) of the camera, WRF."""
+        return self.centre_m + self.axes()[2] * self.distance_m
+
+    @property
+    def principal_px(self) -> tuple[float, float]:
+        """Where the optical axis meets the image."""
+        return self.middle_px or (self.width_px / 2.0, self.height_px / 2.0)
 
     def axes(self) -> Array:
         """Return the camera axes right, up and backwards (3, 3), rows in WRF."""
@@ -76,7 +84,7 @@ class Viewpoint:
     def pinhole(self) -> Camera:
         """Return the camera's intrinsics."""
         w, h = self.width_px, self.height_px
-        return Camera(w, h, self.focal_px, self.focal_px, w / 2.0, h / 2.0)
+        return Camera(w, h, self.focal_px, self.focal_px, *self.principal_px)
 
     def attitude(self) -> Array:
         """Return the rotation (4,) from image axes (right, down, forward) to WRF."""
@@ -90,8 +98,21 @@ class Viewpoint:
         local = (points_m - self.centre_m) @ self.axes().T
         depth = self.distance_m - local[..., 2]
         scale = self.focal_px / np.maximum(depth, _NEAR_M)[..., None]
-        px = local[..., :2] * scale * (1.0, -1.0) + (self.width_px / 2.0, self.height_px / 2.0)
+        px = local[..., :2] * scale * (1.0, -1.0) + self.principal_px
         return px, depth
+
+
+def interpolated(track: Track, time_s: float) -> BodyPose:
+    """Return the pose at a time, between the ticks around it; the first or last one outside."""
+    last = len(track.time_s) - 1
+    row = min(max(int(np.searchsorted(track.time_s, time_s)) - 1, 0), max(last - 1, 0))
+    after = min(row + 1, last)
+    span_s = max(float(track.time_s[after] - track.time_s[row]), 1e-9)
+    share = min(max((time_s - float(track.time_s[row])) / span_s, 0.0), 1.0)
+    p, q = track.position_m, track.q_wxyz
+    end = q[after] if float(q[row] @ q[after]) >= 0.0 else -q[after]
+    turned = (1.0 - share) * q[row] + share * end  # ticks are degrees apart: as good as slerp
+    return p[row] + share * (p[after] - p[row]), turned / np.linalg.norm(turned)
 
 
 @dataclass(frozen=True)
@@ -125,97 +146,51 @@ def _lines(
 def draw(
     scene: Scene,
     view: Viewpoint,
-    sun: Array,
-    target: BodyPose,
-    chasers: dict[int, BodyPose],
-    paths: dict[int | None, Array],
-    seeing: frozenset[int],
-    plumes: dict[int, Array] | None = None,
-    background: BgrImage | None = None,
-    rendered: RenderedBodies | None = None,
+    rendered: RenderedBodies,
+    chasers: Mapping[int, BodyPose],
+    paths: Mapping[int | None, Array],
+    cameras: Mapping[int, bool],
+    plumes: Mapping[int, Array] | None = None,
 ) -> BgrImage:
-    """Draw target and chasers into an image (height, width, 3), BGR.
+    """Draw paths, plumes and the frustums of cameras around rendered bodies: (height, width, 3),
+    BGR.
 
-    ``sun`` (3,): direction to it in WRF, unit length. ``paths``: points (N, 3) WRF behind each
-    chaser, and the target's under None. ``seeing``: chasers whose image was used; their camera
-    frustums are brighter. ``plumes``: nozzles and ends of thruster plumes (K, 2, 3) of each chaser,
-    CRF. ``background``: stars and Earth; plain space without. ``rendered``: takes the place of the
-    background and of the faces of the scene.
+    ``paths``: points (N, 3) WRF behind each chaser, and the target's under None. ``cameras``:
+    chasers whose frustum is drawn, and whether their image was used; then it is brighter.
+    ``plumes``: nozzles and ends of thruster plumes (K, 2, 3) of each chaser, CRF; those behind its
+    centre are hidden by bodies.
     """
-    space = np.full((view.height_px, view.width_px, 3), _SPACE, dtype=np.uint8)
-    if rendered is not None:
-        background = rendered.behind
-    image = space if background is None else background.copy()
+    image = rendered.behind.copy()
     for body, points in paths.items():
         shade = _TARGET_PATH if body is None else (0.75 * tint(body)).tolist()
         _lines(image, view, points, shade)
-    if rendered is None:
-        _draw_faces(image, scene, view, sun, target, chasers)
-    else:
-        image[rendered.covered] = rendered.bgr[rendered.covered]
+    before = []
     for i, lines in (plumes or {}).items():
         position, attitude = chasers[i]
+        _, middle_m = view.project(position)
         for nozzle, end in rotations.rotate(attitude, lines) + position:
-            _draw_plume(image, view, nozzle, end)
-    _draw_cameras(image, view, scene, chasers, seeing)
+            if float(view.project(nozzle)[1]) < float(middle_m):
+                before.append((nozzle, end))
+            else:
+                _draw_plume(image, view, nozzle, end)
+    image[rendered.covered] = rendered.bgr[rendered.covered]
+    for nozzle, end in before:
+        _draw_plume(image, view, nozzle, end)
+    _draw_cameras(image, view, scene, chasers, cameras)
     return image
-
-
-def _draw_faces(
-    image: BgrImage,
-    scene: Scene,
-    view: Viewpoint,
-    sun: Array,
-    target: BodyPose,
-    chasers: dict[int, BodyPose],
-) -> None:
-    """Draw the faces of the bodies that are turned towards the view, the farthest first."""
-    bodies: list[tuple[BodyPose, tuple[Face, ...], Array | None]] = [(target, scene.target, None)]
-    bodies += [(pose, scene.chaser, tint(i)) for i, pose in chasers.items()]
-    eye = view.centre_m + view.axes()[2] * view.distance_m
-    visible = []
-    for (position, attitude), faces, hue in bodies:
-        for face in faces:
-            corners = rotations.rotate(attitude, face.corners_m) + position
-            normal = rotations.rotate(attitude, face.normal)
-            away = eye - corners.mean(axis=0)
-            if normal @ away > 0.0:
-                light = 0.45 + 0.55 * max(0.0, float(normal @ sun))
-                visible.append(
-                    (
-                        float(np.linalg.norm(away)) - face.lift_m,
-                        position,
-                        attitude,
-                        face,
-                        corners,
-                        light,
-                        hue,
-                    )
-                )
-    visible.sort(key=lambda item: -item[0])
-    for _, position, attitude, face, corners, light, hue in visible:
-        px, depth = view.project(corners)
-        if np.any(depth <= _NEAR_M):
-            continue
-        bgr = (
-            np.full(3, float(face.grey)) if hue is None else hue * (0.3 + 0.75 * face.grey / 128.0)
-        )
-        _fill(image, px, bgr * light)
-        for quad, grey in face.decals:
-            px, _ = view.project(rotations.rotate(attitude, quad) + position)
-            _fill(image, px, np.full(3, grey * light))
 
 
 def _draw_cameras(
     image: BgrImage,
     view: Viewpoint,
     scene: Scene,
-    chasers: dict[int, BodyPose],
-    seeing: frozenset[int],
+    chasers: Mapping[int, BodyPose],
+    cameras: Mapping[int, bool],
 ) -> None:
-    """Draw the frustum of each chaser's camera, and its number."""
-    for i, (position, attitude) in chasers.items():
-        strength = 1.0 if i in seeing else 0.4
+    """Draw the frustums of the chasers' cameras, and the chasers' numbers."""
+    for i, used in cameras.items():
+        position, attitude = chasers[i]
+        strength = 1.0 if used else 0.4
         bgr = (strength * tint(i)).tolist()
         far = rotations.rotate(attitude, scene.camera_corners_m) + position
         origin = rotations.rotate(attitude, scene.camera_origin_m) + position
@@ -233,10 +208,20 @@ def _draw_cameras(
 
 
 def _draw_plume(image: BgrImage, view: Viewpoint, nozzle: Array, end: Array) -> None:
-    """Draw a plume as a triangle that widens from the nozzle (3,) to its end (3,), WRF."""
-    px, depth = view.project(np.stack([nozzle, end]))
-    along = px[1] - px[0]
-    if np.any(depth <= _NEAR_M) or float(np.linalg.norm(along)) < 1.0:
-        return
-    across = 0.22 * np.array([-along[1], along[0]])
-    _fill(image, np.stack([px[0], px[1] + across, px[1] - across]), _PLUME)
+    """Draw a plume as a triangle that widens from the nozzle (3,) to its end (3,), WRF, and
+    fades.
+    """
+    for share in (1.0, 0.75, 0.5, 0.25):
+        px, depth = view.project(np.stack([nozzle, nozzle + share * (end - nozzle)]))
+        along = px[1] - px[0]
+        if np.any(depth <= _NEAR_M) or float(np.linalg.norm(along)) < 1.0:
+            return
+        across = 0.22 * np.array([-along[1], along[0]])
+        corners = np.stack([px[0], px[1] + across, px[1] - across])
+        low = np.clip(np.floor(corners.min(axis=0)).astype(int), 0, image.shape[1::-1])
+        high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 1, 0, image.shape[1::-1])
+        part = image[low[1] : high[1], low[0] : high[0]]
+        if part.size:
+            plume = part.copy()
+            _fill(plume, corners - low, _PLUME)
+            cv2.addWeighted(plume, _PLUME_SHARE, part, 1.0 - _PLUME_SHARE, 0.0, dst=part)

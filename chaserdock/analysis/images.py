@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -81,3 +81,19 @@ def columns_for(number: int, aspect: float, width_px: int, height_px: int) -> tu
         if width > best[1]:
             best = (columns, width)
     return best
+
+
+def latest_images(
+    log: Path, chasers: int, times_s: Iterable[float]
+) -> Iterator[tuple[float, dict[int, Pair]]]:
+    """Yield each of the ascending simulated times (s) and the latest image of each chaser then.
+    Where the log is not in order of time, an image may be the one before the latest.
+    """
+    coming = pairs(log, chasers)
+    latest: dict[int, Pair] = {}
+    pair = next(coming, None)
+    for time_s in times_s:
+        while pair is not None and pair[0].sim_time_ns / 1e9 <= time_s + 1e-9:
+            latest[pair[0].chaser] = pair
+            pair = next(coming, None)
+        yield time_s, dict(latest)

@@ -22,6 +22,11 @@ from .images import Pair, pairs
 _AXIS_M = 0.08
 """Length (m) of the drawn axes: about that of a marker."""
 
+_LABEL_PX, _LABEL_DIM = 26, 0.3
+"""Height (px) of the strip behind the label, and by what factor it is darkened: the label is white,
+and so are markers.
+"""
+
 
 def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
     """Return a BGR mosaic of each chaser's last image exposed up to ``at_s``, each ``width_px``
@@ -77,6 +82,7 @@ def annotated_image(
     text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  {seen_text(sighting)}"
     (length_px, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
     size = 0.5 * min(1.0, (width_px - 16) / length_px)  # fit the text into a small image
+    canvas[:_LABEL_PX] = (_LABEL_DIM * canvas[:_LABEL_PX]).astype(np.uint8)
     cv2.putText(canvas, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, size, TEXT_BGR, 1, cv2.LINE_AA)
     return np.asarray(canvas, dtype=np.uint8)
 

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Video of a recorded flight: external view beside the camera images with their detections."""
+"""Video of a recorded flight: an outside view that follows the docking, with the camera images and
+their detections, slow motion at contact, and the verdict as last card.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Protocol
 
 import av
 import cv2
@@ -17,15 +20,25 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import ChaserdockError, errors_of_writing
 from chaserdock_protocol.output_files import replaced
 from chaserdock_protocol.recording.log import LogError
+from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.orbit import earth_disc, to_sun
-from chaserdock_world.rendering.background import Background, Earth, Light
 
+from chaserdock.criterion import table_rows
 from chaserdock.verdict import Verdict, verdict_of
 
 from .body_renderer import BodyRenderer
-from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint, draw, tint
+from .chase_camera import (
+    BgrImage,
+    BodyPose,
+    RenderedBodies,
+    Viewpoint,
+    draw,
+    interpolated,
+    tint,
+)
+from .chase_path import ChasePath, FilmClock, approaches
 from .flight import RecordedFlight, load_flight
-from .images import Pair, columns_for, shots
+from .images import Pair, columns_for, latest_images, pairs
 from .motion import TARGET, Track
 from .scene import scene_of
 from .snapshot import annotated_image
@@ -34,24 +47,67 @@ from .time_series import ActuatorHistory, load_traces
 
 ENDINGS = (".mp4", ".webp", ".gif")
 _CODECS = {".mp4": "libx264", ".webp": "libwebp_anim", ".gif": "gif"}
-_AZIMUTH_RAD, _ELEVATION_RAD = math.radians(-52.0), math.radians(26.0)
 _TRAIL_S = 25.0
 """Time (s) of the path drawn behind each chaser. Larger: more of the manoeuvre, more crossing
 lines.
 """
-_INK = (235, 235, 235)
-"""Colour (BGR, 0 to 255) of text: light on dark images."""
+_INK = (240, 240, 240)
+"""Colour (BGR, 0 to 255) of text, which has a dark outline: it is read on space and on clouds."""
+_OUTLINE = (12, 12, 12)
 _MARGIN_PX = 8
 """Distance (px) of insets from the edge of the image."""
-_DIM = (120, 120, 120)
-"""Colour (BGR, 0 to 255) of axes: darker than curves and text."""
 _PLUME_M = 0.16
 """Length (m) of the drawn plume of a thruster that is always open; for display only, long enough to
 be seen beside a chaser.
 """
-_TITLE_SHARE = 0.12
-"""Share of the video during which the description, and at the end the verdict, is shown."""
-_CLOSE_PHASES = frozenset({"approach", "final", "contact", "latched", "docked"})
+_COLUMN_SHARE = 0.28
+"""Share of the width that camera images and close-up take: markers in them are still seen."""
+_TITLE_S = 4.0
+"""Time (s) of the film during which the description is shown: two lines are read in it."""
+_CARD_S = 4.0
+"""Time (s) of the last card: a dozen rows of a table are looked over."""
+_CARD_DIM = 0.22
+"""Brightness of the last picture behind the card: seen, but text is read."""
+_RATE_S = 0.4
+"""Time (s) over which the closing speed is averaged: six ticks, without the noise of pulses."""
+
+RendererName = Literal["fast", "path"]
+_BGR = {"met": (140, 200, 130), "not met": (90, 90, 240), "not judged": (110, 200, 240)}
+"""Colours (BGR) of the outcomes of criteria."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture of the bodies to be rendered. ``name``: unique in a film."""
+
+    name: str
+    look: Viewpoint
+    target: BodyPose
+    chasers: Mapping[int, BodyPose]
+
+
+class Bodies(Protocol):
+    """Renders the bodies of a film."""
+
+    def render(self, shot: Shot) -> RenderedBodies:
+        """Return the picture of a shot."""
+        ...
+
+
+class FastBodies:
+    """Renders by rasterizing, as the simulated cameras do."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._renderers: dict[tuple[Any, ...], BodyRenderer] = {}
+
+    def render(self, shot: Shot) -> RenderedBodies:
+        """Return the picture of a shot."""
+        look, chasers = shot.look, tuple(shot.chasers)
+        key = (look.width_px, look.height_px, look.middle_px, chasers)
+        if key not in self._renderers:
+            self._renderers[key] = BodyRenderer(self._scenario, chasers, look)
+        return self._renderers[key].render(look, shot.target, shot.chasers)
 
 
 def write_video(
@@ -64,14 +120,18 @@ def write_video(
     part_s: tuple[float, float] = (0.0, math.inf),
     quality: int = 60,
     report_progress: Callable[[float], None] = lambda time_s: None,
+    renderer: RendererName = "fast",
+    samples: int = 16,
+    jobs: int = 1,
 ) -> int:
     """Write the video of a log (or run folder); return the number of frames.
 
     ``out``: file that ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds
-    per second of video. ``part_s``: simulated times of the first and last frame. ``quality``: of
-    .webp, 0 to 100. ``report_progress``: receives the simulated time of each frame. Raise LogError
-    for an unreadable log or one without motion or image, ChaserdockError for an invalid size or
-    file.
+    per second of video, away from contact. ``part_s``: simulated times of the first and last frame.
+    ``quality``: of .webp, 0 to 100. ``report_progress``: receives the simulated time of each frame.
+    ``renderer``: ``path`` traces ``samples`` paths of light a pixel in ``jobs`` processes, by the
+    extra ``film``. Raise LogError for an unreadable log or one without motion or image,
+    ChaserdockError for an invalid size or file.
     """
     ending = out.suffix.lower()
     if ending not in _CODECS:
@@ -82,10 +142,14 @@ def write_video(
         )
     if not part_s[0] < part_s[1]:
         raise ChaserdockError(f"a video from {part_s[0]:g} s to {part_s[1]:g} s has no length")
+    film = film_of(log, load_flight(log), speed, fps, width_px, height_px, part_s)
+    if renderer == "path":
+        from chaserdock.film.frames import PathTracedBodies
 
-    flight = load_flight(log)
-    if TARGET not in flight.motion:
-        raise LogError(f"{log}: holds no motion of the target; nothing to film")
+        folder = out.with_name(out.stem + "-frames")
+        film.bodies = PathTracedBodies(
+            film.flight.scenario, folder, list(film.shots()), samples, jobs
+        )
 
     number = 0
     with errors_of_writing(out), replaced(out) as new, av.open(str(new), "w") as container:
@@ -98,54 +162,351 @@ def write_video(
         elif ending == ".webp":
             stream.options = {"quality": str(quality), "loop": "0", "compression_level": "6"}
 
-        for time_s, frame in frames(log, flight, speed / fps, width_px, height_px, part_s):
+        for time_s, frame in film.frames():
             report_progress(time_s)
             image = av.VideoFrame.from_ndarray(frame, format="bgr24")
             image.pts = number
             container.mux(stream.encode(image))
             number += 1
-        if not number:
-            after = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
-            raise LogError(f"{log}: holds no image{after}; nothing to film")
         container.mux(stream.encode())
     return number
 
 
-def frames(
+def film_of(
     log: Path,
     flight: RecordedFlight,
-    every_s: float,
-    width_px: int,
-    height_px: int,
+    speed: float = 1.0,
+    fps: int = 15,
+    width_px: int = 1280,
+    height_px: int = 720,
     part_s: tuple[float, float] = (0.0, math.inf),
-) -> Iterator[tuple[float, BgrImage]]:
-    """Yield simulated time (s) and video frame (height, width, 3), BGR, every ``every_s`` of
-    simulated time within ``part_s``.
+) -> Film:
+    """Return the film of a flight, its frames not yet drawn. Raise LogError for a log without
+    motion or image.
     """
-    number = len(flight.scenario.chasers)
-    camera = flight.scenario.camera_model()
-    aspect = camera.width_px / camera.height_px
-    columns, shot_px = columns_for(number, aspect, round(0.38 * width_px), height_px)
-    rows, shot_height_px = math.ceil(number / columns), round(shot_px / aspect)
-    side_px = columns * shot_px
+    if TARGET not in flight.motion:
+        raise LogError(f"{log}: holds no motion of the target; nothing to film")
+    first = next(pairs(log, len(flight.scenario.chasers)), None)
+    end_s = min(float(flight.motion[TARGET].time_s[-1]), part_s[1])
+    if first is None or end_s < part_s[0]:
+        after = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
+        raise LogError(f"{log}: holds no image{after}; nothing to film")
+    begin_s = max(part_s[0], float(flight.motion[TARGET].time_s[0]))
     verdict = verdict_of(summary_of_run(flight, log))
-    external = _ExternalView(
-        flight, load_plumes(log, flight), width_px - side_px, height_px, part_s, verdict
-    )
-    for time_s, latest in shots(log, number, every_s, part_s[0]):
-        if time_s > part_s[1] + 1e-9:
+    plumes = load_plumes(log, flight)
+    size = (width_px, height_px)
+    return Film(log, flight, plumes, size, (begin_s, end_s), verdict, speed, fps)
+
+
+@dataclass(frozen=True)
+class Inset:
+    """A place in the frame, px."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+class Layout:
+    """Places in the frame, px: text above and below the scene at the left, a column of insets at
+    the right. ``free_px``: left, top, right and bottom of the part for the scene.
+    """
+
+    def __init__(
+        self, size_px: tuple[int, int], cameras: int, camera_aspect: float, closes_up: bool
+    ) -> None:
+        width, height = size_px
+        column = round(_COLUMN_SHARE * width)
+        left = width - column - _MARGIN_PX
+        self.scale = min(max(height / 720.0, 0.7), 2.0, left / 560.0)
+        self.text_px = left - 3 * _MARGIN_PX
+        self.line_px = min(round(26 * self.scale), height // 4 // max(cameras, 1))
+        foot = round(70 * self.scale) + self.line_px * cameras
+        self.free_px = _MARGIN_PX, round(56 * self.scale), left - _MARGIN_PX, height - foot
+        below = round(0.62 * column) + 2 * _MARGIN_PX if closes_up else _MARGIN_PX
+        self.close_up = Inset(left, _MARGIN_PX, column, round(0.62 * column))
+        columns, shot = columns_for(
+            max(cameras, 1), camera_aspect, column, height - below - _MARGIN_PX
+        )
+        tall = round(shot / camera_aspect)
+        self.cameras = tuple(
+            Inset(left + (i % columns) * shot, below + (i // columns) * tall, shot, tall)
+            for i in range(cameras)
+        )
+
+
+class Film:
+    """A film of a flight; its frames are drawn one after the other."""
+
+    def __init__(
+        self,
+        log: Path,
+        flight: RecordedFlight,
+        plumes: dict[int, ActuatorHistory],
+        size: tuple[int, int],
+        part_s: tuple[float, float],
+        verdict: Verdict,
+        speed: float = 1.0,
+        fps: int = 15,
+    ) -> None:
+        self.flight, self.bodies = flight, FastBodies(flight.scenario)
+        self._log, self._plumes, self._verdict, self._fps = log, plumes, verdict, fps
+        self.size, self._part_s, self._speed = size, part_s, speed
+        self._scene = scene_of(flight.scenario)
+        self.numbers = flight.shown
+        self._target = flight.motion[TARGET]
+        self._chasers = {i: flight.motion[f"chaser/{i}"] for i in self.numbers}
+        self._errors = {i: tracking_errors(flight, i) for i in self.numbers}
+        self._phases = {
+            i: flight.references[i].phases if i in flight.references else [] for i in self.numbers
+        }
+        self._seen = {
+            i: s.time_s[s.seen] for i in self.numbers if (s := flight.sightings.get(i)) is not None
+        }
+        found = approaches(flight.scenario, self._phases, float(self._target.time_s[-1]))
+        camera = flight.scenario.camera_model()
+        self.layout = Layout(
+            size, len(flight.scenario.chasers), camera.width_px / camera.height_px, bool(found)
+        )
+        sun, disc = np.array(to_sun(flight.scenario)), earth_disc(flight.scenario)
+        earth = None if disc is None else np.array(disc[0]) / np.linalg.norm(disc[0])
+        self.path = ChasePath(
+            flight.scenario,
+            self._target,
+            self._chasers,
+            found,
+            size,
+            self.layout.free_px,
+            sun / np.linalg.norm(sun),
+            earth,
+        )
+        contacts = [a.contact_s for a in found if math.isfinite(a.contact_s)]
+        self.clock = FilmClock(*part_s, contacts, speed)
+
+    @cached_property
+    def times(self) -> list[tuple[float, float]]:
+        """Times (s) in film and flight of all frames before the last card."""
+        number = math.floor(self.clock.duration_s * self._fps + 1e-6) + 1
+        return [(k / self._fps, self.clock.flight_time(k / self._fps)) for k in range(number)]
+
+    def shots(self) -> Iterator[Shot]:
+        """Yield all pictures of bodies that the frames need."""
+        for k, (_, time_s) in enumerate(self.times):
+            yield self._shot(f"{k:05d}", self.path.viewpoint(time_s), time_s)
+            close = self._close_look(time_s)
+            if close is not None:
+                yield self._shot(f"{k:05d}-close", close, time_s)
+
+    def frames(self) -> Iterator[tuple[float, BgrImage]]:
+        """Yield simulated time (s) and frame (height, width, 3), BGR; at the end of the flight the
+        last card.
+        """
+        frame: BgrImage | None = None
+        chasers = len(self.flight.scenario.chasers)
+        shown_s = [time_s for _, time_s in self.times]
+        for k, (time_s, latest) in enumerate(latest_images(self._log, chasers, shown_s)):
+            frame = self.draw(k)
+            for i, place in enumerate(self.layout.cameras):
+                view = _camera(self.flight, i, latest.get(i), place.width)
+                _put_inset(frame, place, view, tint(i).tolist())
+            yield time_s, frame
+        if frame is not None and self._part_s[1] >= float(self._target.time_s[-1]) - 1e-6:
+            card = self._card(frame)
+            for _ in range(round(_CARD_S * self._fps)):
+                yield self._part_s[1], card
+
+    def draw(self, number: int) -> BgrImage:
+        """Draw the frame of a number without the camera images."""
+        film_s, time_s = self.times[number]
+        shot = self._shot(f"{number:05d}", self.path.viewpoint(time_s), time_s)
+        focus = self.path.focus(time_s)
+        paths: dict[int | None, Any] = {None: _trail(self._target, time_s)}
+        paths |= {i: _trail(own, time_s) for i, own in self._chasers.items()}
+        at_s = float(self._target.time_s[_row(self._target.time_s, time_s)])
+        cameras = {
+            i: i in self._seen and self._is_near(self._seen[i], at_s)
+            for i in self.numbers
+            if focus is None or focus.chaser != i  # its frustum would cover the gap
+        }
+        plumes = {i: self._plumes_at(i, time_s) for i in shot.chasers if i in self._plumes}
+        image = draw(
+            self._scene,
+            shot.look,
+            self.bodies.render(shot),
+            shot.chasers,
+            paths,
+            cameras,
+            plumes,
+        )
+        close = self._close_look(time_s)
+        if close is not None and focus is not None:
+            near = self._shot(f"{number:05d}-close", close, time_s)
+            view = draw(self._scene, close, self.bodies.render(near), near.chasers, {}, {}, plumes)
+            _put_inset(image, self.layout.close_up, view, tint(focus.chaser).tolist())
+        self._write(image, film_s, time_s)
+        return image
+
+    def _shot(self, name: str, look: Viewpoint, time_s: float) -> Shot:
+        chasers = {i: interpolated(own, time_s) for i, own in self._chasers.items()}
+        return Shot(name, look, interpolated(self._target, time_s), chasers)
+
+    def _close_look(self, time_s: float) -> Viewpoint | None:
+        place = self.layout.close_up
+        return self.path.close_up(time_s, place.width, place.height)
+
+    def _is_near(self, seen_s: Array, time_s: float) -> bool:
+        """Return whether one of the ascending times (K,) s is within half a tick of a time."""
+        row = int(np.searchsorted(seen_s, time_s))
+        half_s = 0.5 / self.flight.scenario.time.rate_hz
+        return any(abs(t - time_s) < half_s for t in seen_s[max(0, row - 1) : row + 1])
+
+    def _plumes_at(self, chaser: int, time_s: float) -> Array:
+        """Return nozzles and plume ends (K, 2, 3), CRF, of a chaser's thrusters that are open at a
+        time.
+        """
+        history, thrusters = self._plumes[chaser], self.flight.scenario.chaser.thrusters
+        row = min(_row(history.edges_s, time_s), len(history.thruster_duty) - 1)
+        lines = [
+            (
+                t.position_m,
+                np.subtract(t.position_m, np.multiply(t.direction, _PLUME_M * (0.4 + 0.6 * duty))),
+            )
+            for t, duty in zip(thrusters, history.thruster_duty[row], strict=True)
+            if duty > 0.02
+        ]
+        return np.array(lines).reshape(-1, 2, 3)
+
+    def _range(self, chaser: int, time_s: float) -> float:
+        """Return the distance, m, from a chaser's probe to its port; from its centre to the
+        target's without a port.
+        """
+        for approach in self.path.approaches:
+            if approach.chaser == chaser and approach.port_m is not None:
+                port, tip, _ = self.path.gap(approach, time_s)
+                return float(np.linalg.norm(tip - port))
+        own, at = (interpolated(t, time_s) for t in (self._chasers[chaser], self._target))
+        return float(np.linalg.norm(own[0] - at[0]))
+
+    def _write(self, image: BgrImage, film_s: float, time_s: float) -> None:
+        """Write clock, range and closing speed, phases and errors into the free part."""
+        scale, width, x = self.layout.scale, self.layout.text_px, _MARGIN_PX + 4
+        line_px = round(26 * scale)
+        write(image, self.flight.scenario.name, x, line_px, 0.75 * scale)
+        clock = f"{time_s:6.1f} s"
+        slower = self.clock.slowdown(film_s)
+        if slower > 1.05:
+            clock += f"   slowed {slower:.1f} x"
+        elif self._speed != 1.0:
+            clock += f"   {self._speed:g} x"
+        write(image, clock, x, 2 * line_px, 0.75 * scale)
+        if film_s < _TITLE_S:
+            lines = wrapped(self.flight.scenario.description, width, 0.6 * scale)
+            for line, text in enumerate(lines):
+                write(image, text, x, round((3.2 + line) * line_px), 0.6 * scale)
+
+        step_px = self.layout.line_px
+        size = min(0.6 * scale, step_px / 36.0)
+        last = self.size[1] - 12
+        for line, i in enumerate(reversed(self.numbers)):
+            times, position, _ = self._errors[i]
+            row = _row(times, time_s)
+            error = f"   {1e3 * position[row]:.1f} mm error" if len(times) else ""
+            text = f"chaser {i}  {_phase(self._phases[i], time_s)}"
+            y = last - line * step_px
+            write(image, text, x, y, size, _light(i))
+            if error:
+                write(image, error, x + round(330 * size), y, size)
+        self._write_range(image, x, last - len(self.numbers) * step_px - round(6 * scale), time_s)
+
+    def _write_range(self, image: BgrImage, x: int, y: int, time_s: float) -> None:
+        """Write range and closing speed of the chaser in the picture's focus, large."""
+        if not self.numbers:
             return
-        frame = np.zeros((height_px, width_px, 3), dtype=np.uint8)
-        frame[:, : width_px - side_px] = external.draw(time_s)
-        top = max(0, (height_px - rows * shot_height_px) // 2)
-        for i in range(number):
-            x = width_px - side_px + (i % columns) * shot_px
-            y = top + (i // columns) * shot_height_px
-            image = _camera(flight, i, latest.get(i), shot_px)
-            h = min(len(image), height_px - y)
-            frame[y : y + h, x : x + shot_px] = image[:h]
-            cv2.rectangle(frame, (x + 1, y + 1), (x + shot_px - 2, y + h - 2), tint(i).tolist(), 2)
-        yield time_s, frame
+        focus, scale = self.path.focus(time_s), self.layout.scale
+        chaser = min(self.numbers, key=lambda i: self._range(i, time_s))
+        chaser = chaser if focus is None else focus.chaser
+        away_m = self._range(chaser, time_s)
+        before_s = max(time_s - _RATE_S, float(self._target.time_s[0]))
+        span_s = time_s - before_s
+        closing = (self._range(chaser, before_s) - away_m) / span_s if span_s > 1e-6 else 0.0
+        has_port = self.flight.scenario.docking.port_of(chaser) is not None
+        values = (
+            (f"{1e3 * away_m:.0f} mm" if away_m < 1.0 else f"{away_m:.2f} m",
+             "probe to port" if has_port else "to the target"),
+            (f"{1e3 * closing + 0.0:.1f} mm/s".replace("-0.0 ", "0.0 "), "closing"),
+        )  # fmt: skip
+        for k, (value, label) in enumerate(values):
+            place = x + round(k * 210 * scale)
+            write(image, label, place, y - round(38 * scale), 0.5 * scale, _light(chaser))
+            write(image, value, place, y, 1.25 * scale, thickness=2)
+
+    def _card(self, frame: BgrImage) -> BgrImage:
+        """Return the last card: the verdict and its criteria over the last frame."""
+        card = np.asarray((_CARD_DIM * frame).astype(np.uint8))
+        scale, height = self.layout.scale, self.size[1]
+        x, width = round(0.06 * self.size[0]), round(0.88 * self.size[0])
+        colour = {"good": "met", "bad": "not met", "partial": "not judged"}[self._verdict.level]
+        size = 1.6 * scale
+        length_px = _length_px(self._verdict.headline, size)
+        size *= min(1.0, width / max(length_px, 1))
+        y = round(90 * scale)
+        write(card, self._verdict.headline, x, y, size, _BGR[colour], thickness=2)
+        rows = table_rows(self._verdict.criteria)
+        lines = [part for text in self._verdict.lines() for part in wrapped(text, width, 0.6)]
+        room = max(height - y - round(30 * scale), 40)
+        step_px = min(round(32 * scale), room // max(len(rows) + len(lines) + 1, 1))
+        size = min(0.65 * scale, step_px / 32.0)
+        columns = (0.0, 0.14, 0.46, 0.62, 0.82)
+        for row in rows:
+            y += step_px
+            c = row.criterion
+            cells = (c.outcome, c.name, f"chaser {row.who}" if row.who else "", *c.cells[:2])
+            for share, cell in zip(columns, cells, strict=True):
+                ink = _BGR[c.outcome] if share == 0.0 else _INK
+                # Without signs that the font does not have.
+                plain = cell.replace("≥", "at least").replace("≤", "at most").replace("\u2013", "-")
+                write(card, plain, x + round(share * width), y, size, ink)
+        y += round(0.5 * step_px)
+        for text in lines:
+            y += step_px
+            write(card, text, x, y, size)
+        return card
+
+
+def write(
+    image: BgrImage,
+    text: str,
+    x: int,
+    y: int,
+    size: float,
+    bgr: Sequence[float] = _INK,
+    thickness: int = 1,
+) -> None:
+    """Write text with a dark outline; ``x``, ``y``: left end of its base line."""
+    # Thicker letters would be wider: the outline is the same letters around.
+    for dx, dy, ink in (*((dx, dy, _OUTLINE) for dx in (-1, 1) for dy in (-1, 1)), (0, 0, bgr)):
+        place = (x + dx, y + dy)
+        cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, ink, thickness, cv2.LINE_AA)
+
+
+def _light(chaser: int) -> list[float]:
+    """Return a chaser's colour, BGR, half way to white: read on the blue Earth, too."""
+    return (0.5 * (tint(chaser) + 255.0)).tolist()
+
+
+def _put_inset(image: BgrImage, place: Inset, view: BgrImage, bgr: Sequence[float]) -> None:
+    """Put a picture into its place, with a frame in a chaser's colour."""
+    h, w = min(len(view), image.shape[0] - place.y), min(view.shape[1], image.shape[1] - place.x)
+    if h < 4 or w < 4:
+        return
+    image[place.y : place.y + h, place.x : place.x + w] = view[:h, :w]
+    corner = (place.x + w - 1, place.y + h - 1)
+    cv2.rectangle(image, (place.x, place.y), corner, bgr, 2, cv2.LINE_AA)
+
+
+def _length_px(text: str, size: float) -> int:
+    return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0]
 
 
 def _camera(flight: RecordedFlight, chaser: int, pair: Pair | None, width_px: int) -> BgrImage:
@@ -169,226 +530,6 @@ def _camera(flight: RecordedFlight, chaser: int, pair: Pair | None, width_px: in
         cv2.LINE_AA,
     )
     return empty
-
-
-class _ExternalView:
-    """Draws the mission from a fixed direction, frame by frame."""
-
-    def __init__(
-        self,
-        flight: RecordedFlight,
-        plumes: dict[int, ActuatorHistory],
-        width_px: int,
-        height_px: int,
-        part_s: tuple[float, float],
-        verdict: Verdict,
-    ) -> None:
-        self.flight, self._plumes, self._verdict = flight, plumes, verdict
-        self.size = (width_px, height_px)
-        self.scene = scene_of(flight.scenario)
-        sun = np.array(to_sun(flight.scenario))
-        self.sun = sun / np.linalg.norm(sun)
-
-        self.numbers = flight.shown
-        self.target = target = flight.motion[TARGET]
-
-        self._begin_s, self._end_s = part_s[0], min(float(target.time_s[-1]), part_s[1])
-        self._span_s = max(self._end_s - self._begin_s, 1e-3)
-        self._sky: BgrImage | None = None
-        self._mesh = flight.scenario.target.nominal_mesh()
-        self._renderers: dict[tuple[int, int], BodyRenderer] = {}
-        self.chasers = {i: flight.motion[f"chaser/{i}"] for i in self.numbers}
-
-        reach, distances, speeds = 0.3, {}, {}
-        for i, own in self.chasers.items():
-            time_s, away_m = own.distance_to(target)
-            closing_m_s = -np.gradient(away_m, time_s) if len(time_s) > 2 else 0.0 * away_m
-            inside = (time_s >= part_s[0]) & (time_s <= part_s[1])
-            distances[i] = time_s[inside], away_m[inside]
-            speeds[i] = time_s[inside], closing_m_s[inside] * 1e3
-            reach = max(reach, float(away_m[inside].max(initial=0.0)))
-        self._graphs = (_graph("distance / m", distances), _graph("closing / mm/s", speeds))
-        # Distant chasers must not shrink all others.
-        self.distance_m = 3.5 * min(reach, 3.0)
-
-        self.errors = {i: tracking_errors(flight, i) for i in self.numbers}
-        self.phases = {
-            i: flight.references[i].phases if i in flight.references else [] for i in self.numbers
-        }
-        self.seen = {
-            i: s.time_s[s.seen] for i in self.numbers if (s := flight.sightings.get(i)) is not None
-        }
-
-    def draw(self, time_s: float) -> BgrImage:
-        """Draw the mission at a simulated time, with clock and phases."""
-        chasers = {i: _pose(own, time_s) for i, own in self.chasers.items()}
-        paths: dict[int | None, Any] = {None: _trail(self.target, time_s)}
-        paths |= {i: _trail(own, time_s) for i, own in self.chasers.items()}
-        at = _pose(self.target, time_s)
-        look = Viewpoint(at[0], self.distance_m, _AZIMUTH_RAD, _ELEVATION_RAD, *self.size)
-        at_s = _time_of(self.target, time_s)
-        seeing = frozenset(i for i, seen_s in self.seen.items() if self._is_near(seen_s, at_s))
-        plumes = {i: self._plumes_at(i, time_s) for i in chasers if i in self._plumes}
-        rendered = self._rendered(look, at, chasers)
-        background = self._background(look) if rendered is None else None
-        image = draw(
-            self.scene, look, self.sun, at, chasers, paths, seeing, plumes, background, rendered
-        )
-        self._close_up(image, at, chasers, plumes, seeing, time_s)
-        self._draw_graph(image, time_s)
-        self._write(image, time_s)
-        return image
-
-    def _is_near(self, seen_s: Array, time_s: float) -> bool:
-        """Return whether one of the ascending times (K,) s is within half a tick of a time."""
-        row = int(np.searchsorted(seen_s, time_s))
-        half_s = 0.5 / self.flight.scenario.time.rate_hz
-        return any(abs(t - time_s) < half_s for t in seen_s[max(0, row - 1) : row + 1])
-
-    def _background(self, look: Viewpoint) -> BgrImage:
-        """Return stars and Earth as the simulated cameras see them, in the direction of view."""
-        if self._sky is None:
-            disc = earth_disc(self.flight.scenario)
-            space = Background(
-                look.pinhole(), np.zeros(2), self.size, None if disc is None else Earth(*disc)
-            )
-            x, y, z = self.sun.tolist()
-            grey = space.draw(look.attitude(), Light((x, y, z)))
-            self._sky = np.repeat(grey[:, :, None], 3, axis=2)
-        return self._sky
-
-    def _rendered(
-        self, look: Viewpoint, at: BodyPose, chasers: dict[int, BodyPose]
-    ) -> RenderedBodies | None:
-        """Return the rendered bodies; None for a target without a mesh, whose faces are drawn."""
-        if self._mesh is None:
-            return None
-        size = (look.width_px, look.height_px)
-        if size not in self._renderers:
-            self._renderers[size] = BodyRenderer(self.flight.scenario, self._mesh, look)
-        return self._renderers[size].render(look, at, chasers, tint)
-
-    def _plumes_at(self, chaser: int, time_s: float) -> Array:
-        """Return nozzles and plume ends (K, 2, 3), CRF, of a chaser's thrusters that are open at a
-        time.
-        """
-        history, thrusters = self._plumes[chaser], self.flight.scenario.chaser.thrusters
-        row = min(_row(history.edges_s, time_s), len(history.thruster_duty) - 1)
-        lines = [
-            (
-                t.position_m,
-                np.subtract(t.position_m, np.multiply(t.direction, _PLUME_M * (0.4 + 0.6 * duty))),
-            )
-            for t, duty in zip(thrusters, history.thruster_duty[row], strict=True)
-            if duty > 0.02
-        ]
-        return np.array(lines).reshape(-1, 2, 3)
-
-    def _close_up(
-        self,
-        image: BgrImage,
-        at: BodyPose,
-        chasers: dict[int, BodyPose],
-        plumes: dict[int, Array],
-        seeing: frozenset[int],
-        time_s: float,
-    ) -> None:
-        """Draw an enlarged view of the gap between the target and a docking chaser into the upper
-        right corner.
-        """
-        close = {
-            i: position - at[0]
-            for i, (position, _) in chasers.items()
-            if _phase(self.phases[i], time_s) in _CLOSE_PHASES
-        }
-        width = round(0.38 * self.size[0])
-        if not close or width < 120:
-            return
-        nearest = min(close, key=lambda i: float(np.linalg.norm(close[i])))
-        away = close[nearest]
-        # From the side, so that the gap between the bodies is visible.
-        across_rad = math.atan2(away[1], away[0]) - math.pi / 2.0
-        distance_m = 2.6 * float(np.linalg.norm(away))
-        look = Viewpoint(
-            at[0] + away / 2.0, distance_m, across_rad, _ELEVATION_RAD, width, round(0.75 * width)
-        )
-        rendered = self._rendered(look, at, chasers)
-        view = draw(self.scene, look, self.sun, at, chasers, {}, seeing, plumes, rendered=rendered)
-        h, w = view.shape[:2]
-        x = self.size[0] - w - _MARGIN_PX
-        image[_MARGIN_PX : _MARGIN_PX + h, x : x + w] = view
-        cv2.rectangle(
-            image,
-            (x, _MARGIN_PX),
-            (x + w - 1, _MARGIN_PX + h - 1),
-            tint(nearest).tolist(),
-            1,
-            cv2.LINE_AA,
-        )
-
-    def _draw_graph(self, image: BgrImage, time_s: float) -> None:
-        """Draw distances to the target and closing speeds since the start of the video into the
-        lower right corner.
-        """
-        width, height = round(0.38 * self.size[0]), round(0.15 * self.size[1])
-        if width < 160 or height < 40:
-            return
-        x0 = self.size[0] - width - _MARGIN_PX
-        for place, graph in enumerate(self._graphs):
-            y0 = self.size[1] - (2 - place) * (height + _MARGIN_PX)
-            cv2.line(image, (x0, y0 + height), (x0 + width, y0 + height), _DIM, 1)
-            label = f"{graph.label}, up to {graph.high:.3g}"
-            cv2.putText(
-                image,
-                label,
-                (x0 + 4, y0 + 10),
-                cv2.FONT_HERSHEY_SIMPLEX,
-                0.42,
-                _INK,
-                1,
-                cv2.LINE_AA,
-            )
-            for i, (times_s, values) in graph.series.items():
-                until = times_s <= time_s + 1e-6
-                x = x0 + (times_s[until] - self._begin_s) / self._span_s * width
-                share = np.clip((values[until] - graph.low) / (graph.high - graph.low), 0.0, 1.0)
-                points = (
-                    np.stack([x, y0 + height - share * (height - 14)], axis=1)
-                    .round()
-                    .astype(np.int32)
-                )
-                cv2.polylines(image, [points], False, tint(i).tolist(), 1, cv2.LINE_AA)
-
-    def _write(self, image: BgrImage, time_s: float) -> None:
-        def put(text: str, x: int, y: int, bgr: Any, size: float = 0.5) -> None:
-            cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, bgr, 1, cv2.LINE_AA)
-
-        put(f"{self.flight.scenario.name}", _MARGIN_PX + 4, 24, _INK, 0.6)
-        put(f"t = {time_s:6.1f} s", _MARGIN_PX + 4, 48, _INK, 0.6)
-        if time_s - self._begin_s < _TITLE_SHARE * self._span_s:
-            for line, text in enumerate(
-                wrapped(self.flight.scenario.description, self.size[0] - 3 * _MARGIN_PX, 0.5)
-            ):
-                put(text, _MARGIN_PX + 4, 72 + 20 * line, _INK, 0.5)
-        if (
-            self._end_s - time_s < _TITLE_SHARE * self._span_s
-            and self._end_s >= float(self.target.time_s[-1]) - 1e-6
-        ):
-            put(self._verdict.headline, _MARGIN_PX + 4, 72, _INK, 0.8)
-            lines = (
-                part
-                for text in self._verdict.lines()
-                for part in wrapped(text, self.size[0] - 3 * _MARGIN_PX, 0.5)
-            )
-            for line, text in enumerate(lines):
-                put(text, _MARGIN_PX + 4, 96 + 20 * line, _INK, 0.5)
-        for line, i in enumerate(self.numbers):
-            phase = _phase(self.phases[i], time_s)
-            times, position, _ = self.errors[i]
-            error = f"{1e3 * position[_row(times, time_s)]:7.2f} mm error" if len(times) else ""
-            y = self.size[1] - 14 - 20 * (len(self.numbers) - 1 - line)
-            put(f"chaser {i}  {phase:<9}", _MARGIN_PX + 4, y, tint(i).tolist())
-            put(error, _MARGIN_PX + 180, y, _INK)
 
 
 def wrapped(text: str, width_px: int, size: float) -> list[str]:
@@ -420,42 +561,11 @@ def load_plumes(log: Path, flight: RecordedFlight) -> dict[int, ActuatorHistory]
     return {i: h for i, h in histories.items() if h.thruster_duty.shape[1]}
 
 
-@dataclass(frozen=True)
-class _Graph:
-    """Values of each chaser over the shown part of the flight, and their scale. ``series``: times
-    (K,) s and values (K,).
-    """
-
-    label: str
-    series: dict[int, tuple[Array, Array]]
-    low: float
-    high: float
-
-
-def _graph(label: str, series: dict[int, tuple[Array, Array]]) -> _Graph:
-    """Return a graph whose scale excludes the extreme hundredths of the values."""
-    known = np.concatenate(
-        [values for _, values in series.values() if len(values)] or [np.zeros(1)]
-    )
-    low, high = min(0.0, float(np.percentile(known, 1))), max(1e-3, float(np.percentile(known, 99)))
-    return _Graph(label, series, low, high)
-
-
 def _row(times_s: Array, time_s: float) -> int:
     """Return the row of the last of the times (K,) up to ``time_s``; the first row if there is
     none.
     """
     return max(0, int(np.searchsorted(times_s, time_s + 1e-6)) - 1)
-
-
-def _time_of(track: Track, time_s: float) -> float:
-    return float(track.time_s[_row(track.time_s, time_s)])
-
-
-def _pose(track: Track, time_s: float) -> BodyPose:
-    """Return the pose at the last tick up to a time, as in an image of that time."""
-    row = _row(track.time_s, time_s)
-    return track.position_m[row], track.q_wxyz[row]
 
 
 def _trail(track: Track, time_s: float) -> Any:

@@ -185,7 +185,15 @@ def _draw_cameras(log: Path, out: Path, at_s: float, width: int) -> None:
     write_image(out, snapshot(log, at_s, width))
 
 
+class FilmRenderer(StrEnum):
+    """What draws the bodies of a film."""
+
+    fast = "fast"
+    path = "path"
+
+
 def video(
+    context: typer.Context,
     log: LogArg,
     out: Annotated[Path, typer.Option(help="video to write: .mp4 (H.264), .webp or .gif")],
     speed: Annotated[
@@ -197,12 +205,27 @@ def video(
     from_s: FromOpt = 0.0,
     to_s: ToOpt = None,
     quality: Annotated[int, typer.Option(min=0, max=100, help=".webp: image quality")] = 60,
+    renderer: Annotated[
+        FilmRenderer, typer.Option(help="fast: as the cameras; path: path tracing, needs mitsuba")
+    ] = FilmRenderer.fast,
+    samples: Annotated[
+        int, typer.Option(min=1, max=4096, help="--renderer path: paths of light per pixel")
+    ] = 16,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="--renderer path: processes")] = 1,
 ) -> None:
-    """Render a recorded flight as a video: an outside view beside the camera images with their
-    detections.
+    """Render a recorded flight as a video: an outside view that follows the docking, with the
+    camera images and their detections, slow motion at contact, and the verdict at the end.
+
+    With --renderer path, pictures are kept in a folder beside the video: an interrupted film is
+    resumed.
     """
     from chaserdock.analysis.video import write_video
 
+    if renderer is not FilmRenderer.path:
+        refuse_options(context, ("samples", "jobs"), "only with --renderer path")
     window_s = (from_s, float("inf") if to_s is None else to_s)
-    number = write_video(log, out, speed, fps, width, height, window_s, quality)
+    number = write_video(
+        log, out, speed, fps, width, height, window_s, quality,
+        renderer=renderer.value, samples=samples, jobs=jobs,
+    )  # fmt: skip
     print(f"{out}: {number} frames, {number / fps:.1f} s")

@@ -57,5 +57,6 @@ def test_demo_docks_and_leaves_report_and_film(tmp_path: Path) -> None:
     assert (folder / "report.html").is_file()
     with av.open(str(folder / demo.FILM)) as film:
         seconds = float(film.duration or 0) / 1e6
-    assert seconds == pytest.approx(load_scenario(find_scenario("demo")).duration_s, abs=0.2)
+    flown_s = load_scenario(find_scenario("demo")).duration_s
+    assert flown_s + 6.0 < seconds < flown_s + 14.0  # slow motion at contact, and the last card
     assert "the viewer is at http://127.0.0.1:" in done.stderr

@@ -39,8 +39,9 @@ from motion_cases import track, true_motion
 from scipy.stats import chi2
 
 from chaserdock.analysis.approach import approach_of
+from chaserdock.analysis.body_renderer import BodyRenderer
 from chaserdock.analysis.charts import ChartData
-from chaserdock.analysis.chase_camera import Viewpoint, draw
+from chaserdock.analysis.chase_camera import Viewpoint
 from chaserdock.analysis.figures import (
     FIGURES,
     _FewTicks,
@@ -67,7 +68,7 @@ from chaserdock.analysis.time_series import (
     Traces,
     load_traces,
 )
-from chaserdock.analysis.video import _ExternalView, frames, wrapped, write_video
+from chaserdock.analysis.video import Film, film_of, wrapped, write_video
 from chaserdock.criterion import quantity
 from chaserdock.verdict import Verdict
 
@@ -628,21 +629,22 @@ def test_drawn_target_shows_its_markers(
 ) -> None:
     """Drawn face-on, a face shows exactly the markers on it, neither mirrored nor rotated."""
     wanted = target_model(model)
-    scene = scene_of(scenario(target={"model": model}))
     view = Viewpoint(np.zeros(3), 1.2, np.radians(azimuth), np.radians(elevation), 1200, 1200)
     pose = (np.zeros(3), rotations.IDENTITY)
-    image = draw(scene, view, view.axes()[2], pose, {}, {}, frozenset())
+    flown = scenario(target={"model": model}, camera={"sun_direction": view.axes()[2].tolist()})
+    found = BodyRenderer(flown, (), view).render(view, pose, {})
+    image = np.where(found.covered[:, :, None], found.bgr, np.uint8(128))
     table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, wanted.dictionary))
     corners, ids, _ = cv2.aruco.ArucoDetector(table).detectMarkers(image)
     normal = view.axes()[2]
     there = {k.id for k in wanted.markers if k.normal_trf() @ normal > 0.99}
     assert ids is not None
     assert set(np.ravel(ids).tolist()) == there
-    for marker_id, found in zip(np.ravel(ids).tolist(), corners, strict=True):
+    for marker_id, quad in zip(np.ravel(ids).tolist(), corners, strict=True):
         marker = wanted.marker(int(marker_id))
         assert marker is not None
         expected, _ = view.project(marker.corners_trf_m())
-        np.testing.assert_allclose(np.reshape(found, (4, 2)), expected, atol=2.0)
+        np.testing.assert_allclose(np.reshape(quad, (4, 2)), expected, atol=2.0)
 
 
 def test_a_satellite_is_drawn_as_its_mesh() -> None:
@@ -660,17 +662,15 @@ def test_a_satellite_is_drawn_as_its_mesh() -> None:
     assert len(scene.chaser) > 100
     view = Viewpoint(np.zeros(3), 2.6, np.radians(-70.0), np.radians(35.0), 480, 400)
     pose = (np.zeros(3), rotations.IDENTITY)
-    image = draw(scene, view, view.axes()[2], pose, {}, {}, frozenset()).astype(int)
+    image = BodyRenderer(flown, (), view).render(view, pose, {}).bgr.astype(int)
     radiator = next(p for p in satellite("geo_servicer").parts if p.name == "radiator_south")
-    centre, extent = radiator.vertices_m.mean(axis=0), 0.35 * np.ptp(radiator.vertices_m, axis=0)
-    points = [
-        centre + np.array([sx * extent[0], -0.002, sz * extent[2]])
-        for sx in (-1, 0.5)
-        for sz in (-1, 1)
-    ]
-    px, _ = view.project(np.array(points))
-    levels = [image[round(y), round(x), 0] for x, y in px]
-    assert min(levels) > 190, levels  # white paint; the wall is grey
+    px, _ = view.project(radiator.vertices_m.mean(axis=0) - np.array([0.09, 0.002, 0.05]))
+    x, y = np.round(px).astype(int)
+    paint = image[y, x]
+    assert np.ptp(paint) < 12, paint  # white paint; foil is golden
+    foil = view.project(np.array([-0.19, -0.161, -0.14]))[0]
+    x, y = np.round(foil).astype(int)
+    assert image[y, x, 2] > 1.4 * image[y, x, 0]
 
 
 def test_external_view_shows_plumes_and_the_simulated_stars(tmp_path: Path) -> None:
@@ -681,13 +681,54 @@ def test_external_view_shows_plumes_and_the_simulated_stars(tmp_path: Path) -> N
     views = []
     for duty in (np.zeros((1, thrusters)), np.ones((1, thrusters))):
         history = ActuatorHistory(np.array([0.0, 1.0]), np.zeros((1, 3)), np.zeros((1, 3)), duty)
-        view = _ExternalView(flight, {0: history}, 640, 480, (0.0, 1.0), Verdict(True))
-        views.append(view.draw(0.2))
+        film = Film(Path(), flight, {0: history}, (640, 480), (0.0, 1.0), Verdict(True))
+        views.append(film.draw(3))
     idle, firing = (view.astype(int) for view in views)
     brighter = (firing - idle).min(axis=2) > 20
     assert np.count_nonzero(brighter) > 50
     # Stars: single bright pixels far from the bodies, which are in the middle.
-    assert np.count_nonzero(idle[80:300, 10:200].min(axis=2) > 40) > 0
+    assert np.count_nonzero(idle[60:440, 460:].min(axis=2) > 40) > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("demo", (640, 360)),
+        ("four-chaser-capture", (1280, 720)),
+        ("four-chaser-capture", (320, 180)),
+    ],
+)
+def test_labels_do_not_overlap_the_insets(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, size: tuple[int, int]
+) -> None:
+    flight = load_flight(made_log(tmp_path / "a.mcap", 5))
+    flight.scenario = load_scenario(find_scenario(name))
+    flight.references = {0: ReferenceHistory(
+        np.zeros(0), np.zeros((0, 3)), [(0.0, "approach")], np.zeros((0, 2))
+    )}  # fmt: skip
+    film = Film(Path(), flight, {}, size, (0.0, 0.3), Verdict(True))
+    insets = [*film.layout.cameras, film.layout.close_up]
+    for k, one in enumerate(insets):
+        assert one.x + one.width <= size[0]
+        assert one.y + one.height <= size[1]
+        for other in insets[k + 1 :]:
+            apart_x = one.x + one.width <= other.x or other.x + other.width <= one.x
+            apart_y = one.y + one.height <= other.y or other.y + other.height <= one.y
+            assert apart_x or apart_y
+    film.draw(1)  # paints the chasers' numbers, too
+    labels: list[tuple[int, int]] = []
+
+    def put(
+        image: Any, text: str, place: tuple[int, int], font: int, scale: float, *_: Any
+    ) -> None:
+        if image.shape[:2] == size[::-1]:
+            labels.append((place[0] + cv2.getTextSize(text, font, scale, 2)[0][0], place[1]))
+
+    monkeypatch.setattr("chaserdock.analysis.video.cv2.putText", put)
+    film.draw(2)
+    assert labels
+    assert max(right for right, _ in labels) <= film.layout.close_up.x
+    assert max(bottom for _, bottom in labels) <= size[1]
 
 
 def test_description_is_written_in_full_within_the_width() -> None:
@@ -708,19 +749,20 @@ def test_video_is_playable(short_flight: Path, tmp_path: Path) -> None:
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert (stream.width, stream.height, stream.average_rate) == (640, 360, 10)
         images = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
-    assert len(images) == number == 31  # 6 s at double speed, both ends
-    assert np.mean(np.abs(images[0].astype(float) - images[-1])) > 0.3  # something moves
+    assert len(images) == number == 31 + 40  # 6 s at double speed, both ends; 4 s of verdict
+    assert np.mean(np.abs(images[0].astype(float) - images[30])) > 0.3  # something moves
+    assert np.mean(np.abs(images[31].astype(float) - images[-1])) < 0.5
 
 
 def test_video_of_an_interval(tmp_path: Path) -> None:
     """Frames cover the interval; an empty interval or one after the end raises an error."""
     log = made_log(tmp_path / "a.mcap", 8)
-    every = [time_s for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180)]
-    part = [
-        time_s
-        for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180, (every[2], every[5]))
-    ]
-    assert part == pytest.approx(every[2:6])
+    flight = load_flight(log)
+    every = [time_s for time_s, _ in film_of(log, flight, 1.0, 15, 320, 180).frames()]
+    window = (every[2], every[5])
+    part = [time_s for time_s, _ in film_of(log, flight, 1.0, 15, 320, 180, window).frames()]
+    assert part == pytest.approx(every[2:6])  # without the last card
+    assert len(every) == 8 + 60
     with pytest.raises(ChaserdockError, match="no length"):
         write_video(log, tmp_path / "a.webp", part_s=(2.0, 2.0))
     with pytest.raises(LogError, match="no image after 100 s"):
@@ -731,7 +773,7 @@ def test_video_of_an_interval(tmp_path: Path) -> None:
 def test_video_as_webp_and_gif(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 8)
     for name, begins in (("a.webp", b"RIFF"), ("a.gif", b"GIF89a")):
-        assert write_video(log, tmp_path / name, width_px=320, height_px=180) == 8
+        assert write_video(log, tmp_path / name, width_px=320, height_px=180) == 8 + 60
         assert (tmp_path / name).read_bytes().startswith(begins)
 
 

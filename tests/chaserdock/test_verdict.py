@@ -162,7 +162,7 @@ def test_film_says_all_of_the_verdict(log: Path, monkeypatch: pytest.MonkeyPatch
         written.append(words)
 
     monkeypatch.setattr(video.cv2, "putText", put)
-    for _ in video.frames(log, load_flight(log), 0.2, 1280, 360):
+    for _ in video.film_of(log, load_flight(log), 3.0, 15, 1280, 360).frames():
         pass
     assert said(" ".join(written)) == []
 

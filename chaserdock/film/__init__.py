@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Path-traced films (optional: extra ``film``): the entry is `frames.PathTracedBodies`."""

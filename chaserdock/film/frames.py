@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Path-traced pictures of a film as PNG files, drawn in parallel; what is there is kept."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+from chaserdock_protocol.errors import ChaserdockError, errors_of_writing
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_world.orbit import earth_disc
+from chaserdock_world.rendering.background import Background, Earth
+
+from chaserdock.analysis.body_renderer import coloured_space, light_of, shown
+from chaserdock.analysis.chase_camera import BgrImage, RenderedBodies, Viewpoint
+from chaserdock.analysis.video import Shot
+
+from .path_tracer import PathTracer, fastest_variant, require_mitsuba
+
+PLAN = "plan.txt"
+"""Name of the file beside the pictures that says of what they are."""
+
+
+class PathTracedBodies:
+    """Renders the shots of a film into a folder by path tracing, then returns them by name.
+
+    Pictures that the folder holds of the same film are kept: an interrupted film is resumed. Those
+    of another film are deleted. Raise ChaserdockError without mitsuba.
+    """
+
+    def __init__(
+        self, scenario: Scenario, folder: Path, shots: Sequence[Shot], samples: int, jobs: int
+    ) -> None:
+        require_mitsuba()
+        self._folder, self._light = folder, light_of(scenario)
+        disc = earth_disc(scenario)
+        self._earth = None if disc is None else Earth(*disc)
+        self._spaces: dict[tuple[object, ...], Background] = {}
+        missing = _missing(folder, _plan_of(scenario, shots, samples), shots)
+        self.drawn = len(missing)
+        if not missing:
+            return
+        variant = fastest_variant()
+        chasers = tuple(missing[0].chasers)
+        # Not forked: the renderer has threads. Each process draws every jobs-th picture.
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(jobs, context) as pool:
+            parts = [missing[k::jobs] for k in range(jobs)]
+            running = [
+                pool.submit(_draw, scenario, chasers, folder, part, samples, variant)
+                for part in parts
+            ]
+            for one in running:
+                one.result()
+
+    def render(self, shot: Shot) -> RenderedBodies:
+        """Return the picture of a shot over stars and Earth."""
+        file = self._folder / f"{shot.name}.png"
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        if image is None or image.shape != (shot.look.height_px, shot.look.width_px, 4):
+            raise ChaserdockError(f"{file}: cannot be read as a picture of this film")
+        behind, cover = self._behind(shot.look), image[:, :, 3:].astype(np.float32) / 255.0
+        mixed = cover * image[:, :, :3] + (1.0 - cover) * behind
+        return RenderedBodies(behind, mixed.astype(np.uint8), cover[:, :, 0] > 0.0)
+
+    def _behind(self, look: Viewpoint) -> BgrImage:
+        key = (look.width_px, look.height_px, look.middle_px)
+        if key not in self._spaces:
+            size = (look.width_px, look.height_px)
+            self._spaces[key] = Background(look.pinhole(), np.zeros(2), size, self._earth)
+        return shown(coloured_space(self._spaces[key].draw(look.attitude(), self._light)))
+
+
+def _plan_of(scenario: Scenario, shots: Sequence[Shot], samples: int) -> str:
+    """Return a digest of all that the pictures depend on."""
+    digest = hashlib.sha256(scenario.model_dump_json().encode())
+    for shot in shots:
+        poses = [shot.target, *shot.chasers.values()]
+        numbers = np.concatenate([np.concatenate(pose) for pose in poses]).round(9)
+        digest.update(f"{shot.name} {shot.look!r} {list(shot.chasers)}".encode())
+        digest.update(numbers.tobytes())
+    return f"{digest.hexdigest()} samples {samples}\n"
+
+
+def _missing(folder: Path, plan: str, shots: Sequence[Shot]) -> list[Shot]:
+    """Return the shots whose pictures are not in the folder; delete those of another plan."""
+    with errors_of_writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        stated = folder / PLAN
+        if not stated.is_file() or stated.read_text(encoding="utf-8") != plan:
+            for file in folder.glob("[0-9]*.png"):
+                file.unlink()
+            stated.write_text(plan, encoding="utf-8")
+    return [shot for shot in shots if not (folder / f"{shot.name}.png").is_file()]
+
+
+def _draw(
+    scenario: Scenario,
+    chasers: tuple[int, ...],
+    folder: Path,
+    shots: Sequence[Shot],
+    samples: int,
+    variant: str,
+) -> None:
+    """Draw pictures into the folder. A picture is complete where it has its name."""
+    tracer = PathTracer(scenario, chasers, samples, variant)
+    for shot in shots:
+        seed = int.from_bytes(hashlib.sha256(shot.name.encode()).digest()[:4], "big")
+        image = tracer.render(shot.look, shot.target, shot.chasers, seed)
+        part = folder / f"part-{os.getpid()}.png"
+        with errors_of_writing(folder):
+            cv2.imwrite(str(part), image)
+            part.replace(folder / f"{shot.name}.png")
+        print(f"\r{shot.name}", end="", file=sys.stderr, flush=True)

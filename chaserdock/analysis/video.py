@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, cast
 
 import av
 import cv2
@@ -250,7 +250,7 @@ class Film:
         speed: float = 1.0,
         fps: int = 15,
     ) -> None:
-        self.flight, self.bodies = flight, FastBodies(flight.scenario)
+        self.flight, self.bodies = flight, cast(Bodies, FastBodies(flight.scenario))
         self._log, self._plumes, self._verdict, self._fps = log, plumes, verdict, fps
         self.size, self._part_s, self._speed = size, part_s, speed
         self._scene = scene_of(flight.scenario)

@@ -38,6 +38,7 @@ _DEPTH = 4
 _EARTHSHINE = 0.16
 """Irradiance of a white Earth over that of the sun: its albedo of 0.3, half of its disc lit."""
 _EARTH_RGB = (0.55, 0.75, 1.0)
+"""Colour (red, green, blue) of the Earth's light relative to white: sea under air and clouds."""
 _WRINKLE_M, _WRINKLE_DEPTH = 0.30, 0.012
 """Period and depth (m) of the wrinkles in foil: those of a loosely laid blanket."""
 _CELL_M = 0.040

@@ -77,7 +77,7 @@ class BodyRenderer:
         white = self._white.render(eye, attitude, *target, obstacles, even).astype(np.float32)
         empty = self._white.render(eye, attitude, *nothing, (), even).astype(np.float32)
         share = (white - empty) / np.maximum(WHITE_LEVEL - empty, 1.0)
-        return np.clip(share, 0.0, 1.0)[:, :, None]
+        return np.clip(share, 0.0, 1.0)[:, :, None].astype(np.float32)
 
 
 def light_of(scenario: Scenario) -> Light:

@@ -116,6 +116,16 @@ def interpolated(track: Track, time_s: float) -> BodyPose:
 
 
 @dataclass(frozen=True)
+class Shot:
+    """A picture of the bodies to be rendered. ``name``: unique in a film."""
+
+    name: str
+    look: Viewpoint
+    target: BodyPose
+    chasers: Mapping[int, BodyPose]
+
+
+@dataclass(frozen=True)
 class RenderedBodies:
     """Rendered bodies over a background (`body_renderer`). ``bgr`` (h, w, 3): the image.
     ``behind`` (h, w, 3): the same without bodies. ``covered`` (h, w): pixels that a body covers.

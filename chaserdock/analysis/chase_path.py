@@ -18,6 +18,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.targets import Box, cuboid_corners
 from chaserdock_protocol.scenario import FlightScenario
+from numpy.typing import NDArray
 
 from .chase_camera import BodyPose, Viewpoint, interpolated
 from .motion import Track
@@ -283,7 +284,7 @@ class ChasePath:
         azimuth = start + TUNING.orbit_rad_s * (self._times - meet_s)
         return azimuth, np.full(len(azimuth), TUNING.elevation_rad)
 
-    def _close_direction(self, approach: Approach, rows: Array) -> Array:
+    def _close_direction(self, approach: Approach, rows: NDArray[np.intp]) -> Array:
         """Return unit vectors (K, 3), WRF, to the camera beside the docking axis. It is turned
         about that axis to where no body hides the gap, the sun shines, and the Earth is behind.
         """
@@ -307,11 +308,11 @@ class ChasePath:
 
         def fault(roll: float) -> float:
             total = 0.0
-            for row in judged:
-                to_camera = direction(int(row), roll)
-                port, tip, axis = self.gap(approach, times[row])
+            for row in judged.tolist():
+                to_camera, time_s = direction(row, roll), float(times[row])
+                port, tip, axis = self.gap(approach, time_s)
                 points = np.stack([port, tip]) + 1e-3 * axis
-                total += 10.0 * self._hidden(points.mean(0) + 1.5 * to_camera, points, times[row])
+                total += 10.0 * self._hidden(points.mean(0) + 1.5 * to_camera, points, time_s)
                 total += 4.0 * max(0.0, abs(_angles(to_camera)[1]) - TUNING.steepest_rad)
                 total += 0.8 * abs(float(to_camera @ self._sun) - 0.5)  # lit, and with shadows
                 if self._earth is not None:
@@ -375,7 +376,10 @@ def _smoothed(values: Array, sigma: float) -> Array:
     """Return values (K,) smoothed by a Gaussian of ``sigma`` rows; the ends are continued."""
     reach = math.ceil(3.0 * sigma)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    return np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), mode="valid")
+    return np.asarray(
+        np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), mode="valid"),
+        dtype=float,
+    )
 
 
 def _transported(axes: Array, begin: int) -> Array:

@@ -305,7 +305,7 @@ def _add_thrusters(body: Body, scenario: FlightScenario) -> None:
         rod = ((0.0, 0.0), (_STRUT_M, 0.0), (_STRUT_M, away_m), (0.0, away_m))
         axis = _vector((at - nearest) / away_m)
         body.add(METAL, lathe("strut", _PLAIN, rod, _vector(nearest), axis, _TOLERANCE_M))
-        body.add(METAL, box("hub", _PLAIN, (2.5 * _STRUT_M,) * 3, at))
+        body.add(METAL, box("hub", _PLAIN, _vector(np.full(3, 2.5 * _STRUT_M)), at))
 
 
 def _disc(centre: Array, axis: Array, radius_m: float) -> list[Array]:

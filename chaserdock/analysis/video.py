@@ -6,12 +6,12 @@ their detections, slow motion at contact, and the verdict as last card.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, cast
 
 import av
 import cv2
@@ -29,8 +29,8 @@ from chaserdock.verdict import Verdict, verdict_of
 from .body_renderer import BodyRenderer
 from .chase_camera import (
     BgrImage,
-    BodyPose,
     RenderedBodies,
+    Shot,
     Viewpoint,
     draw,
     interpolated,
@@ -54,6 +54,7 @@ lines.
 _INK = (240, 240, 240)
 """Colour (BGR, 0 to 255) of text, which has a dark outline: it is read on space and on clouds."""
 _OUTLINE = (12, 12, 12)
+"""Colour (BGR, 0 to 255) of the outline: almost black."""
 _MARGIN_PX = 8
 """Distance (px) of insets from the edge of the image."""
 _PLUME_M = 0.16
@@ -74,16 +75,6 @@ _RATE_S = 0.4
 RendererName = Literal["fast", "path"]
 _BGR = {"met": (140, 200, 130), "not met": (90, 90, 240), "not judged": (110, 200, 240)}
 """Colours (BGR) of the outcomes of criteria."""
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A picture of the bodies to be rendered. ``name``: unique in a film."""
-
-    name: str
-    look: Viewpoint
-    target: BodyPose
-    chasers: Mapping[int, BodyPose]
 
 
 class Bodies(Protocol):
@@ -250,7 +241,7 @@ class Film:
         speed: float = 1.0,
         fps: int = 15,
     ) -> None:
-        self.flight, self.bodies = flight, FastBodies(flight.scenario)
+        self.flight, self.bodies = flight, cast(Bodies, FastBodies(flight.scenario))
         self._log, self._plumes, self._verdict, self._fps = log, plumes, verdict, fps
         self.size, self._part_s, self._speed = size, part_s, speed
         self._scene = scene_of(flight.scenario)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
-import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -14,13 +13,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 from chaserdock_protocol.errors import ChaserdockError, errors_of_writing
+from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.orbit import earth_disc
 from chaserdock_world.rendering.background import Background, Earth
 
 from chaserdock.analysis.body_renderer import coloured_space, light_of, shown
-from chaserdock.analysis.chase_camera import BgrImage, RenderedBodies, Viewpoint
-from chaserdock.analysis.video import Shot
+from chaserdock.analysis.chase_camera import BgrImage, RenderedBodies, Shot, Viewpoint
+from chaserdock.images import write_image
 
 from .path_tracer import PathTracer, fastest_variant, require_mitsuba
 
@@ -97,7 +97,7 @@ def _missing(folder: Path, plan: str, shots: Sequence[Shot]) -> list[Shot]:
         if not stated.is_file() or stated.read_text(encoding="utf-8") != plan:
             for file in folder.glob("[0-9]*.png"):
                 file.unlink()
-            stated.write_text(plan, encoding="utf-8")
+            write_atomically(stated, plan)
     return [shot for shot in shots if not (folder / f"{shot.name}.png").is_file()]
 
 
@@ -114,8 +114,5 @@ def _draw(
     for shot in shots:
         seed = int.from_bytes(hashlib.sha256(shot.name.encode()).digest()[:4], "big")
         image = tracer.render(shot.look, shot.target, shot.chasers, seed)
-        part = folder / f"part-{os.getpid()}.png"
-        with errors_of_writing(folder):
-            cv2.imwrite(str(part), image)
-            part.replace(folder / f"{shot.name}.png")
+        write_image(folder / f"{shot.name}.png", image)
         print(f"\r{shot.name}", end="", file=sys.stderr, flush=True)

@@ -38,6 +38,7 @@ _DEPTH = 4
 _EARTHSHINE = 0.16
 """Irradiance of a white Earth over that of the sun: its albedo of 0.3, half of its disc lit."""
 _EARTH_RGB = (0.55, 0.75, 1.0)
+"""Colour (red, green, blue) of the Earth's light relative to white: sea under air and clouds."""
 _WRINKLE_M, _WRINKLE_DEPTH = 0.30, 0.012
 """Period and depth (m) of the wrinkles in foil: those of a loosely laid blanket."""
 _CELL_M = 0.040
@@ -47,7 +48,7 @@ _ROUGH_FOIL, _ROUGH_METAL, _ROUGH_PLASTIC = 0.22, 0.30, 0.12
 _MIRROR_SHARE = 0.45
 """Share of a metal's reflection that is a mirror's; the rest is diffuse, of wrinkles finer than a
 pixel. Without it, foil in black space is black."""
-_DENOISE, _DENOISE_COLOUR = 6.0, 10.0
+_DENOISE, _DENOISE_COLOUR = 5.0, 6.0
 """Strength of the denoising of brightness and colour, grey levels: the noise of 16 samples is
 about twice that."""
 
@@ -238,7 +239,8 @@ def _surfaces(body: Body) -> dict[Coat, tuple[Array, Array, Array]]:
         soup = triangle_soup(mesh)
         corners, normals = soup.corners_m.reshape(-1, 3), soup.normals.reshape(-1, 3)
         # Seen along the axis that the triangle faces most.
-        flat = np.cross(*(soup.corners_m[:, k] - soup.corners_m[:, 0] for k in (1, 2)))
+        first, second, third = np.moveaxis(soup.corners_m, 1, 0)
+        flat = np.cross(second - first, third - first)
         axis = np.repeat(np.abs(flat).argmax(axis=1), 3)
         rows = np.arange(len(corners))
         uv = np.column_stack([corners[rows, (axis + 1) % 3], corners[rows, (axis + 2) % 3]])
@@ -273,7 +275,7 @@ def _displayed(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     # Exponent before rounding: the dark half has more levels then.
     bright = np.asarray((255.0 * (levels / 255.0) ** GAMMA).astype(np.uint8))
     denoised = cv2.fastNlMeansDenoisingColored(bright, None, _DENOISE, _DENOISE_COLOUR, 5, 15)
-    return np.dstack([denoised, (255.0 * cover).astype(np.uint8)])
+    return np.dstack([denoised, 255.0 * cover]).astype(np.uint8)
 
 
 if __name__ == "__main__":

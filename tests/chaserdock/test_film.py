@@ -13,8 +13,8 @@ from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
-from chaserdock.analysis.chase_camera import Viewpoint
-from chaserdock.analysis.video import FastBodies, Shot
+from chaserdock.analysis.chase_camera import Shot, Viewpoint
+from chaserdock.analysis.video import FastBodies
 from chaserdock.film import frames
 from chaserdock.film.path_tracer import require_mitsuba
 

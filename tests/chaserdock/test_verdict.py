@@ -158,8 +158,11 @@ def test_report_says_all_of_the_verdict(log: Path) -> None:
 def test_film_says_all_of_the_verdict(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written: list[str] = []
 
-    def put(_: Any, words: str, *more: Any) -> None:
+    draw = video.cv2.putText
+
+    def put(image: Any, words: str, *more: Any) -> Any:
         written.append(words)
+        return draw(image, words, *more)
 
     monkeypatch.setattr(video.cv2, "putText", put)
     for _ in video.film_of(log, load_flight(log), 3.0, 15, 1280, 360).frames():

@@ -37,17 +37,16 @@ slower; smaller: pictures of two moments.
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture of the page: size of the window (px), time (s), colours, and what is done first."""
+    """A picture of the page: size of the window (px) and colours."""
 
     width_px: int
     height_px: int
     dark: bool = False
-    at_end: bool = False
 
 
 SHOTS = {
     "viewer-log": Shot(1280, 800),
-    "viewer-dark": Shot(1280, 800, dark=True, at_end=True),
+    "viewer-dark": Shot(1280, 800, dark=True),
     "viewer-phone": Shot(390, 844),
 }
 
@@ -82,8 +81,6 @@ def photograph(browser: Any, url: str, shot: Shot) -> np.ndarray:
         close.click()
     if shot.width_px > 600:
         page.locator("text=position error, mm").first.wait_for()
-    if shot.at_end:
-        page.get_by_role("slider").first.press("End")
     page.wait_for_timeout(SETTLED_MS)
     data = page.screenshot(type="png", timeout=PATIENCE_MS)
     page.close()

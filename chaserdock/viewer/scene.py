@@ -46,6 +46,9 @@ _REFERENCE_M, _REFERENCE_RAD = 0.02, math.radians(3.0)
 nearer ones lie inside the body.
 """
 _RING_RGB = (96, 104, 116)
+"""Colour (0 to 255) of the rings: grey, darker than the faint lines of chasers. Brighter: they hide
+paths.
+"""
 _STARS_M = 100.0
 """Distance of the stars, m: far outside the scene."""
 _IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))

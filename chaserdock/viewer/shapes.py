@@ -27,6 +27,7 @@ the view is moved; smaller than the scene: chasers would fly through it.
 _CAP = (24, 72)
 """Rings and sides of the drawn Earth. Larger: rounder limb, more triangles."""
 _SEA_RGB, _CLOUD_RGB = (38.0, 82.0, 150.0), (225.0, 232.0, 240.0)
+"""Colours (0 to 255) of the Earth in sunlight, chosen. Brighter sea: bodies stand out less."""
 _NIGHT = 0.06
 """Brightness of the Earth's night side, so that its disc is seen before black space."""
 _SIDES = 24

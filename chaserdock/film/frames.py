@@ -7,7 +7,7 @@ import hashlib
 import multiprocessing
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, wait
 from pathlib import Path
 
 import cv2
@@ -24,6 +24,8 @@ from chaserdock.images import write_image
 
 from .path_tracer import PathTracer, fastest_variant, require_mitsuba
 
+_PROGRESS_S = 1.0
+"""Interval, s, at which the number of pictures is shown."""
 PLAN = "plan.txt"
 """Name of the file beside the pictures that says of what they are."""
 
@@ -57,12 +59,16 @@ class PathTracedBodies:
                 pool.submit(_draw, scenario, chasers, folder, part, samples, variant)
                 for part in parts
             ]
+            while wait(running, _PROGRESS_S).not_done:
+                drawn = sum(_file_of(folder, shot).is_file() for shot in missing)
+                print(f"\r{drawn} of {len(missing)} pictures", end="", file=sys.stderr, flush=True)
+            print(file=sys.stderr)
             for one in running:
                 one.result()
 
     def render(self, shot: Shot) -> RenderedBodies:
         """Return the picture of a shot over stars and Earth."""
-        file = self._folder / f"{shot.name}.png"
+        file = _file_of(self._folder, shot)
         image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         if image is None or image.shape != (shot.look.height_px, shot.look.width_px, 4):
             raise ChaserdockError(f"{file}: cannot be read as a picture of this film")
@@ -98,7 +104,12 @@ def _missing(folder: Path, plan: str, shots: Sequence[Shot]) -> list[Shot]:
             for file in folder.glob("[0-9]*.png"):
                 file.unlink()
             write_atomically(stated, plan)
-    return [shot for shot in shots if not (folder / f"{shot.name}.png").is_file()]
+    return [shot for shot in shots if not _file_of(folder, shot).is_file()]
+
+
+def _file_of(folder: Path, shot: Shot) -> Path:
+    """Return the file of a picture."""
+    return folder / f"{shot.name}.png"
 
 
 def _draw(
@@ -114,5 +125,4 @@ def _draw(
     for shot in shots:
         seed = int.from_bytes(hashlib.sha256(shot.name.encode()).digest()[:4], "big")
         image = tracer.render(shot.look, shot.target, shot.chasers, seed)
-        write_image(folder / f"{shot.name}.png", image)
-        print(f"\r{shot.name}", end="", file=sys.stderr, flush=True)
+        write_image(_file_of(folder, shot), image)

@@ -539,12 +539,12 @@ def controller() -> None:
 def planar() -> None:
     """``planar-docking`` from above: paths, bodies at the start and when the latches hold."""
     f = flight("planar-docking")
-    s, end = f.scenario, len(f.truth["target"].time_s) - 1
-    sizes = dict.fromkeys(f.truth, s.chaser.size_m) | {"target": s.target_model().size_m}
+    s, end = f.scenario, len(f.motion["target"].time_s) - 1
+    sizes = dict.fromkeys(f.motion, s.chaser.size_m) | {"target": s.target_model().size_m}
     with styled():
         figure = Figure(figsize=(6.4, 4.6))
         axes = figure.add_subplot()
-        for name, own in sorted(f.truth.items(), reverse=True):
+        for name, own in sorted(f.motion.items(), reverse=True):
             shade = INK if name == "target" else colour(int(name.partition("/")[2]))
             half = np.array(sizes[name]) / 2.0
             corners = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) * half

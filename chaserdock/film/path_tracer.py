@@ -87,13 +87,12 @@ class PathTracer:
     def __init__(
         self, scenario: Scenario, chasers: tuple[int, ...], samples: int, variant: str = _PLAIN
     ) -> None:
-        import drjit
-        import mitsuba
-
+        mitsuba: Any = importlib.import_module("mitsuba")
         mitsuba.set_variant(variant)
         mitsuba.set_log_level(mitsuba.LogLevel.Error)
+        drjit: Any = importlib.import_module("drjit")
         drjit.set_thread_count(1)  # frames are in parallel
-        self._mi: Any = mitsuba
+        self._mi = mitsuba
         self._samples = samples
         self._sun, self._disc = np.array(to_sun(scenario)), earth_disc(scenario)
         self._target = _surfaces(target_body(scenario))

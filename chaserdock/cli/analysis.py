@@ -154,7 +154,8 @@ def _write_report(log: Path, out: Path | None) -> None:
 
     console = Console(stderr=True)
     columns = (BarColumn(20), TaskProgressColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console, transient=True) as bar:
+    hidden = not console.is_terminal  # it would print an empty line
+    with Progress(*columns, console=console, transient=True, disable=hidden) as bar:
         task = bar.add_task("")
 
         def show(step: str, done: int, steps: int) -> None:

@@ -16,6 +16,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from chaserdock_agents.gateway.devices import DeviceError
+from chaserdock_agents.gateway.drivers.gripper import Gripper
 from chaserdock_agents.router import acl_audit
 from chaserdock_agents.router.acl_audit import Denial
 from chaserdock_protocol.scenario import ScenarioError, parse_scenario
@@ -44,6 +46,16 @@ def error_of(text: str) -> str:
     return f"chaserdock: {caught.value}"
 
 
+def refused_release() -> str:
+    """Return the error of a gripper whose autopilot denies its release."""
+    gripper = Gripper("gripper 1", lambda action, attempt: None, lambda: 0, False)
+    gripper.command("release")
+    gripper.acknowledge(2)
+    with pytest.raises(DeviceError) as caught:
+        gripper.poll()
+    return str(caught.value)
+
+
 PRINTED: dict[str, Callable[[], str]] = {
     "chaserdock: mine.toml: duration_s: must be a number greater than 0 and at most 7776000 "
     "(got '40')": lambda: error_of('duration_s = "40"'),
@@ -54,6 +66,7 @@ PRINTED: dict[str, Callable[[], str]] = {
     "chaser-1 may not publish on world/tick": lambda: str(
         Denial("chaser-1", acl_audit._ACTIONS["Put"], "world/tick")
     ),
+    "gripper 1, release: denied": refused_release,
 }
 """Quoted messages that the sources put together of several texts, and what makes them."""
 CODE = {"(camera, target)"}

@@ -94,7 +94,8 @@ def failing(folder: Path, tests: Sequence[str], timeout_s: float) -> str:
     names = re.findall(r"^(?:FAILED|ERROR) (\S+::.*?)(?: - |$)", done.stdout, re.MULTILINE)
     if names:
         return names[0]
-    lost = re.findall(r"(?:no collectors for|not found:) .*?/(tests/\S+)", done.stdout + done.stderr)
+    said = done.stdout + done.stderr
+    lost = re.findall(r"(?:no collectors for|not found:) .*?/(tests/\S+)", said)
     if lost or done.returncode == 2:
         return [*lost, *tests][0]  # its modules cannot be imported
     raise RuntimeError(f"pytest: status {done.returncode}\n{done.stdout}{done.stderr}")

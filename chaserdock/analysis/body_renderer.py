@@ -20,7 +20,7 @@ from chaserdock_world.rendering.scene_geometry import Obstacle
 from numpy.typing import NDArray
 
 from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint, tint
-from .film_bodies import Body, chaser_body, target_body
+from .film_bodies import DressedBody, chaser_body, target_body
 
 AMBIENT = 0.22
 """Share of ambient light: less than in the cameras' images, so that shadows are dark, but the
@@ -45,7 +45,7 @@ class BodyRenderer:
         target = target_body(scenario)
         bodies = {i: chaser_body(scenario, i, reflectance(i)) for i in chasers}
 
-        def renderer(mesh_of: Callable[[Body], TriangleMesh]) -> MeshRenderer:
+        def renderer(mesh_of: Callable[[DressedBody], TriangleMesh]) -> MeshRenderer:
             chosen = {self._places[i][0]: mesh_of(bodies[i]) for i in chasers}
             return MeshRenderer(camera, mesh_of(target), substitutes=chosen)
 

@@ -98,7 +98,7 @@ class FilmClock:
 
 
 @dataclass(frozen=True)
-class Approach:
+class FilmedApproach:
     """An approach of a chaser to its port. ``port_m``, ``axis`` (3,): in TRF; without a port, the
     chaser docks at a distance. ``contact_s``: inf without contact.
     """
@@ -113,7 +113,7 @@ class Approach:
 
 def approaches(
     scenario: FlightScenario, phases: Mapping[int, Sequence[tuple[float, str]]], end_s: float
-) -> tuple[Approach, ...]:
+) -> tuple[FilmedApproach, ...]:
     """Return the approaches in the phases (start in s, name) of the chasers, by time of contact."""
     out = []
     for chaser, changes in phases.items():
@@ -133,7 +133,7 @@ def approaches(
                 done_s = until_s if name in APPROACHING else start_s
                 if math.isfinite(contact_s) and port is None:
                     done_s = min(done_s, contact_s + TUNING.docked_s)
-                out.append(Approach(chaser, begin_s, contact_s, done_s, *place))
+                out.append(FilmedApproach(chaser, begin_s, contact_s, done_s, *place))
             begin_s, contact_s = None, math.inf
     return tuple(sorted(out, key=lambda a: (a.contact_s, a.begin_s, a.chaser)))
 
@@ -151,7 +151,7 @@ class ChasePath:
         scenario: FlightScenario,
         target: Track,
         chasers: Mapping[int, Track],
-        found: Sequence[Approach],
+        found: Sequence[FilmedApproach],
         size_px: tuple[int, int],
         free_px: tuple[int, int, int, int],
         to_sun: Array,
@@ -174,12 +174,12 @@ class ChasePath:
         self._shots = self._schedule(end_s)
         self._compute()
 
-    def focus(self, time_s: float) -> Approach | None:
+    def focus(self, time_s: float) -> FilmedApproach | None:
         """Return the approach that the camera shows, until its chaser is verified."""
         active = [a for b, e, a in self._shots if b <= time_s <= e]
         return active[-1] if active else None
 
-    def gap(self, approach: Approach, time_s: float) -> tuple[Array, Array, Array]:
+    def gap(self, approach: FilmedApproach, time_s: float) -> tuple[Array, Array, Array]:
         """Return the port (the target's centre without one), the probe's tip, and the outward axis
         of the port, (3,) each, in WRF.
         """
@@ -224,14 +224,14 @@ class ChasePath:
             centre, distance_m, look.azimuth_rad, look.elevation_rad, width_px, height_px
         )
 
-    def hidden(self, look: Viewpoint, approach: Approach, time_s: float) -> bool:
+    def hidden(self, look: Viewpoint, approach: FilmedApproach, time_s: float) -> bool:
         """Return whether a body's cuboid is between the camera and the port or the probe's tip."""
         port, tip, axis = self.gap(approach, time_s)
         return self._hidden(look.eye_m, np.stack([port + 1e-3 * axis, tip + 1e-3 * axis]), time_s)
 
-    def _schedule(self, end_s: float) -> list[tuple[float, float, Approach]]:
+    def _schedule(self, end_s: float) -> list[tuple[float, float, FilmedApproach]]:
         """Return one shot after the other: begin, end, what is shown."""
-        shots: list[tuple[float, float, Approach]] = []
+        shots: list[tuple[float, float, FilmedApproach]] = []
         for approach in self.approaches:
             begin_s = max(approach.begin_s, shots[-1][1] if shots else -math.inf)
             until_s = min(approach.end_s + TUNING.linger_s, end_s)
@@ -284,7 +284,7 @@ class ChasePath:
         azimuth = start + TUNING.orbit_rad_s * (self._times - meet_s)
         return azimuth, np.full(len(azimuth), TUNING.elevation_rad)
 
-    def _close_direction(self, approach: Approach, rows: NDArray[np.intp]) -> Array:
+    def _close_direction(self, approach: FilmedApproach, rows: NDArray[np.intp]) -> Array:
         """Return unit vectors (K, 3), WRF, to the camera beside the docking axis. It is turned
         about that axis to where no body hides the gap, the sun shines, and the Earth is behind.
         """

@@ -85,7 +85,7 @@ def coat_of(material: Material) -> Coat:
 
 
 @dataclass
-class Body:
+class DressedBody:
     """A body in its own axes: parts of a mesh, each with a coat."""
 
     parts: list[tuple[MeshPart, Coat]] = field(default_factory=list)
@@ -123,9 +123,9 @@ class Body:
         return TriangleMesh("film", tuple(parts), {})
 
 
-def target_body(scenario: FlightScenario) -> Body:
+def target_body(scenario: FlightScenario) -> DressedBody:
     """Return the target: its mesh, or its boxes in foil with their markers; and its ports."""
-    body, mesh = Body(), scenario.target.nominal_mesh()
+    body, mesh = DressedBody(), scenario.target.nominal_mesh()
     if mesh is not None:
         for part in mesh.parts:
             body.add(coat_of(part.material), part)
@@ -143,9 +143,9 @@ def target_body(scenario: FlightScenario) -> Body:
     return body
 
 
-def chaser_body(scenario: FlightScenario, number: int, tint: Rgb) -> Body:
+def chaser_body(scenario: FlightScenario, number: int, tint: Rgb) -> DressedBody:
     """Return a chaser in its colour (red, green, blue, 0 to 1), its number painted on."""
-    own, body = scenario.chaser, Body()
+    own, body = scenario.chaser, DressedBody()
     coloured = Coat(tint, (0.08, 0.08, 0.08), 15.0)
     if own.mesh:
         shape = satellite(own.mesh)
@@ -189,7 +189,7 @@ def _cuboid(name: str, shape: Box) -> MeshPart:
     return replace(part, vertices_m=at)
 
 
-def _dress(body: Body, size_m: Vector3, coloured: Coat) -> None:
+def _dress(body: DressedBody, size_m: Vector3, coloured: Coat) -> None:
     """Add a cuboid's bus, walls and rails, all within its size."""
     size, rail_m, inset_m = np.array(size_m), _RAIL_SHARE * min(size_m), _INSET_SHARE * min(size_m)
     x, y, z = (size - 2.0 * inset_m).tolist()
@@ -234,7 +234,13 @@ def _on_face(size_m: Vector3, face: int, inset_m: float) -> Callable[[Array], Ar
 
 
 def _paint_number(
-    body: Body, size_m: Vector3, face: int, text: str, share: float, inset_m: float, coloured: Coat
+    body: DressedBody,
+    size_m: Vector3,
+    face: int,
+    text: str,
+    share: float,
+    inset_m: float,
+    coloured: Coat,
 ) -> None:
     """Add a plate in the chaser's colour with its number in white to the middle of a face."""
     right, up, _ = face_extent(size_m, face)
@@ -261,7 +267,7 @@ def _paint_number(
     body.add_quads(WHITE, quads, 3 * _LIFT_M)
 
 
-def _add_markers(body: Body, model: TargetModel) -> None:
+def _add_markers(body: DressedBody, model: TargetModel) -> None:
     """Add the markers of a target: white borders, black squares, white cells."""
     layers: list[tuple[list[Array], int]] = [([], 242), ([], 13), ([], 242)]
     for marker in model.markers:
@@ -286,7 +292,7 @@ def _within(boxes: Sequence[Box], quad: Array) -> Array:
     return quad
 
 
-def _add_thrusters(body: Body, scenario: FlightScenario) -> None:
+def _add_thrusters(body: DressedBody, scenario: FlightScenario) -> None:
     """Add nozzles at the places of the thrusters, each blowing against its force. Outside of the
     cuboid a strut carries them.
     """

@@ -35,13 +35,13 @@ from .time_series import load_traces
 _DASH = "–"  # noqa: RUF001
 
 
-ReportProgress = Callable[[str, int, int], None]
+ReportStep = Callable[[str, int, int], None]
 """Receives what is done next, the number of steps that are done, and that of all."""
 _READ = ("reading the log", "reading time series")
 
 
 def write_report(
-    log: Path, out: Path | None = None, progress: ReportProgress = lambda *_: None
+    log: Path, out: Path | None = None, progress: ReportStep = lambda *_: None
 ) -> Path:
     """Write the report of a log (or run folder), by default ``report.html`` beside the log; return
     its path. ``progress``: called before each step.
@@ -54,7 +54,7 @@ def write_report(
     return out
 
 
-def report_of(log: Path, progress: ReportProgress = lambda *_: None) -> str:
+def report_of(log: Path, progress: ReportStep = lambda *_: None) -> str:
     """Return the report as HTML. Raise LogError for an unreadable log."""
     steps = [*_READ, *(f"figure: {kind.title}" for kind in FIGURES), "replay and images"]
 

@@ -199,7 +199,7 @@ class Inset:
     height: int
 
 
-class Layout:
+class FrameLayout:
     """Places in the frame, px: text above and below the scene at the left, a column of insets at
     the right. ``free_px``: left, top, right and bottom of the part for the scene.
     """
@@ -257,7 +257,7 @@ class Film:
         }
         found = approaches(flight.scenario, self._phases, float(self._target.time_s[-1]))
         camera = flight.scenario.camera_model()
-        self.layout = Layout(
+        self.layout = FrameLayout(
             size, len(flight.scenario.chasers), camera.width_px / camera.height_px, bool(found)
         )
         sun, disc = np.array(to_sun(flight.scenario)), earth_disc(flight.scenario)

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from chaserdock.analysis.body_renderer import AMBIENT, GAMMA, reflectance
 from chaserdock.analysis.chase_camera import BodyPose, Viewpoint
-from chaserdock.analysis.film_bodies import Body, Coat, chaser_body, target_body
+from chaserdock.analysis.film_bodies import Coat, DressedBody, chaser_body, target_body
 
 _COMPILED, _PLAIN = "llvm_ad_rgb", "scalar_rgb"
 _DEPTH = 4
@@ -228,7 +228,7 @@ def _directional(along: Array, irradiance: tuple[float, ...]) -> dict[str, Any]:
     return {"type": "directional", "direction": along.tolist(), "irradiance": _rgb(irradiance)}
 
 
-def _surfaces(body: Body) -> dict[Coat, tuple[Array, Array, Array]]:
+def _surfaces(body: DressedBody) -> dict[Coat, tuple[Array, Array, Array]]:
     """Return corners, normals (3 m, 3) and texture coordinates (3 m, 2), m, of the m triangles of
     each coat, body axes.
     """

@@ -423,7 +423,7 @@ def flight_errors(log: Path, scenario: Scenario) -> tuple[Array, Array, RobotIde
     return error, found.covariance[np.ix_(kept, kept)], found
 
 
-FLOWN = 2
+FLOWN = 1
 """Seeds of each scenario; docs/evidence/laboratory.md has the figures of five."""
 FLIGHTS = {
     "single-thrusters": {

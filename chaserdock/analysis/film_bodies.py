@@ -21,7 +21,7 @@ from chaserdock_models.satellites import box, lathe, satellite
 from chaserdock_models.targets import Box, TargetModel, face_extent, face_rotation
 from chaserdock_protocol.scenario import FlightScenario
 
-from .scene import marker_decals
+from .scene import filled_runs, marker_decals
 
 Rgb = tuple[float, float, float]
 
@@ -259,9 +259,8 @@ def _paint_number(
     pitch_m = min(tall / _DIGIT_ROWS, 0.8 * width * right / columns)
     quads = []
     for row in range(_DIGIT_ROWS):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], cells[row], [False]]).astype(int)))
         y0, y1 = ((_DIGIT_ROWS / 2.0 - k) * pitch_m * 2.0 / up for k in (row, row + 1))
-        for first, last in edges.reshape(-1, 2).tolist():
+        for first, last in filled_runs(cells[row]):
             x0, x1 = ((k - columns / 2.0) * pitch_m * 2.0 / right for k in (first, last))
             quads.append(place(np.array([[x0, y0], [x0, y1], [x1, y1], [x1, y0]])))
     body.add_quads(WHITE, quads, 3 * _LIFT_M)

@@ -14,6 +14,7 @@ from chaserdock_models.meshes import TriangleMesh
 from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, face_rotation
 from chaserdock_protocol.scenario import FlightScenario
+from numpy.typing import NDArray
 
 Grey = int
 """Grey level when fully lit, 0 black to 255 white."""
@@ -71,6 +72,12 @@ class Scene:
     camera_corners_m: Array
 
 
+def filled_runs(row: NDArray[np.bool_]) -> list[list[int]]:
+    """Return begin and end of each run of filled cells of a row (N,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
+    return edges.reshape(-1, 2).tolist()
+
+
 def marker_decals(model: TargetModel, marker: Marker) -> tuple[tuple[Array, Grey], ...]:
     """Return the quadrangles (4, 3), TRF, of a marker: white border, black square, then the white
     cells row by row.
@@ -89,8 +96,7 @@ def marker_decals(model: TargetModel, marker: Marker) -> tuple[tuple[Array, Grey
     margin = model.white_margin_m / marker.side_m
     out = [(quad(-margin, -margin, 1 + margin, 1 + margin), 242), (quad(0, 0, 1, 1), 13)]
     for row in range(n):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], cells[row], [False]]).astype(int)))
-        for first, last in edges.reshape(-1, 2).tolist():
+        for first, last in filled_runs(cells[row]):
             out.append((quad(first / n, row / n, last / n, (row + 1) / n), 242))
     return tuple(out)
 

@@ -34,6 +34,7 @@ from .results import (
     rate,
     remarks,
     repeat_command,
+    share_text,
     wilson,
 )
 from .worker import FlightOutcome
@@ -108,8 +109,7 @@ def _outcomes(rows: list[ResultRow]) -> list[PageSection]:
     bar = Markup(f'<div class="outcomes">{"".join(parts)}</div>')
     lines: list[tuple[str, ...]] = []
     for level, text, n in shown:
-        low, high = wilson(n, len(rows))
-        share = f"{100 * n / len(rows):.1f} % ({100 * low:.1f} to {100 * high:.1f} %)"
+        share = share_text(n, len(rows))
         lines.append((str(n), share, Markup(f'<span class="{level}">{html.escape(text)}</span>')))
     head = ("runs", "share (95 %, Wilson)", "outcome (# stands for a number)")
     return [PageSection("Outcomes by cause", (bar, Table(head, tuple(lines), text=True)))]

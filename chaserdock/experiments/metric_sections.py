@@ -25,7 +25,7 @@ from .metrics import (
     quantile_interval,
 )
 from .page import PageSection, Table
-from .results import wilson
+from .results import share_text
 
 WORST = 3
 """Number of worst runs that are listed of each metric: enough to see whether they share a cause."""
@@ -52,10 +52,7 @@ def _criteria(found: list[Metric]) -> list[PageSection]:
         if not m.is_judged:
             continue
         met, missed = m.count("met"), m.count("not met")
-        share = _DASH
-        if met + missed:
-            low, high = wilson(met, met + missed)
-            share = f"{100 * met / (met + missed):.1f} % ({100 * low:.1f} to {100 * high:.1f} %)"
+        share = share_text(met, met + missed) if met + missed else _DASH
         body.append((m.name, _limits(m), str(met), str(missed), str(m.count("not judged")), share))
     if not body:
         return []

@@ -156,6 +156,12 @@ def wilson(passed: int, total: int, confidence: float = 0.95) -> tuple[float, fl
     return float(interval.low), float(interval.high)
 
 
+def share_text(passed: int, total: int) -> str:
+    """Return a share in percent with its Wilson interval. Raise ValueError as `wilson`."""
+    low, high = wilson(passed, total)
+    return f"{100 * passed / total:.1f} % ({100 * low:.1f} to {100 * high:.1f} %)"
+
+
 def in_part(row: ResultRow) -> bool:
     """Return whether a run met what was judged, but not all of its criteria were."""
     return bool(row["success"]) and row["not_judged"] != "[]"

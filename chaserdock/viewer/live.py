@@ -101,19 +101,27 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
                 f"{url_of(options.host, server.get_port(), token)} shows the mission; Ctrl-C ends "
                 "this",
             )
-            patient, run_id = _Patience(connect, stop), ""
+
+            def ended() -> bool:
+                return stop() or options.folder is not None and _is_flown(options.folder)
+
+            patient, run_id = _Patience(connect, ended), ""
             with suppress(_Stopped):
-                while not stop():
-                    mission = _next_mission(patient, server, run_id, stop)
+                while not ended():
+                    mission = _next_mission(patient, server, run_id, ended)
                     if mission is None:
                         continue
                     run_id = mission.run_id
-                    _MissionView(patient, server, mission, options).run(stop)
-                    if options.folder is not None:
-                        over = _Unwatched(server, stop) if watch_parent else stop
-                        show_flown(server, options, report, place, over)
-                        break
+                    _MissionView(patient, server, mission, options).run(ended)
+            if options.folder is not None and not stop():
+                closed = _Unwatched(server, stop) if watch_parent else stop
+                show_flown(server, options, report, place, closed)
     return STOPPED
+
+
+def _is_flown(folder: Path) -> bool:
+    """Return whether the mission of a folder has ended and its log is complete."""
+    return not (folder / ADDRESS_FILE).exists()
 
 
 class _Unwatched:
@@ -166,7 +174,10 @@ def _join(node: Node) -> JoinReply | None:
 
 
 def _next_mission(
-    connect: Callable[[], Node], server: viser.ViserServer, past: str, stop: StopSignal
+    connect: Callable[[], Node],
+    server: viser.ViserServer,
+    past: str,
+    stop: Callable[[], bool],
 ) -> JoinReply | None:
     """Wait for a mission other than ``past`` and show the status on the page. Returns None when
     stopped.
@@ -270,15 +281,15 @@ class _MissionView:
             timeline=None,
         )
 
-    def run(self, stop: StopSignal) -> None:
-        """Receive and draw at most ten times per second, for at most half of the time. Ends when
-        another mission starts, or that of the folder is over.
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Receive and draw at most ten times per second, for at most half of the time, until
+        another mission starts.
         """
         operator = threading.Thread(target=self._operate, name="operator", daemon=True)
         operator.start()
         joined_s = connected_s = time.monotonic()
         try:
-            while not stop() and not self._is_over():
+            while not stop():
                 begun_s = time.monotonic()
                 self._receive()
                 self._add_past()
@@ -330,10 +341,6 @@ class _MissionView:
         if self._state.tick is not tick:
             self._received_s = time.monotonic()
             self._paces.append((self._received_s, self._state.time_s()))
-
-    def _is_over(self) -> bool:
-        """Return whether the mission of the folder has ended and its log is complete."""
-        return self._folder is not None and not (self._folder / ADDRESS_FILE).exists()
 
     def _add_past(self) -> None:
         """Add the events before the first tick seen, as soon as the log holds them."""

@@ -191,6 +191,22 @@ def test_run_with_a_viewer_that_nobody_watches_ends_after_the_flight(tmp_path: P
     assert not (tmp_path / "run" / ADDRESS_FILE).exists()
 
 
+def test_viewer_that_comes_after_its_mission_ends(tmp_path: Path) -> None:
+    """As with ``run --view`` of a short flight: its viewer starts slower than the flight ends."""
+    port = free_port()
+    write_address(tmp_path, MissionAddress(namespace="over", endpoint=f"tcp/127.0.0.1:{port}"))
+    process = chaserdock(
+        *("view", "--run", str(tmp_path), "--watch-parent"),
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    with process:
+        assert process.stderr is not None
+        assert b" shows the mission" in process.stderr.readline()
+        remove_address(tmp_path)
+        assert process.wait(timeout=60) == 130
+
+
 TWO_FRAMES = """
 window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 500);
 window.cancelAnimationFrame = clearTimeout;"""

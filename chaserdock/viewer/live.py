@@ -103,7 +103,7 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
             )
 
             def ended() -> bool:
-                return stop() or options.folder is not None and _is_flown(options.folder)
+                return stop() or (options.folder is not None and _is_flown(options.folder))
 
             patient, run_id = _Patience(connect, ended), ""
             with suppress(_Stopped):

@@ -14,7 +14,7 @@ from chaserdock_protocol.pose_image import UnusableImage
 from numpy.typing import ArrayLike, NDArray
 
 from . import baseline as paper
-from . import corners, detect, pnp
+from . import corners, detect, pattern, pnp
 from .corners import CornerErrors
 from .pnp import FurtherMarkers, TargetPose
 from .reading import PLACE_CELLS, CellReader
@@ -219,8 +219,20 @@ class Perception:
     def refined(
         self, image: NDArray[np.uint8], px: Array, rows: NDArray[np.intp]
     ) -> corners.Refined:
+        """Return the corners of markers, refined by all cells of small ones, by the sides of
+        others; ``px`` (n, 4, 2), ideal: where they are to about two pixels.
+        """
         margin, outlined = self.table.margin_share[rows], self.table.outlined[rows]
-        return corners.refine(image, self.camera, px, self.reader.cells, margin, outlined)
+        refined = corners.refine(image, self.camera, px, self.reader.cells, margin, outlined)
+        small = pattern.are_small(self.camera, px, self.reader.cells)
+        if not small.any():
+            return refined
+        start, rows, margin, outlined = px[small], rows[small], margin[small], outlined[small]
+        white, by_sides = self.reader.white[rows], refined.part(small)
+        fitted, explained = pattern.fit(image, self.camera, by_sides.corners_px, white, margin, outlined)
+        other, better = pattern.fit(image, self.camera, start, white, margin, outlined)
+        fitted = fitted.with_others(which := better > explained, other.part(which))
+        return refined.with_others(small, fitted)
 
     def _estimate_paper(self, image: NDArray[np.uint8]) -> PerceptionResult:
         found = paper.detect(image, self.camera, self._dictionary)

@@ -67,12 +67,12 @@ class CellReader:
     def __init__(self, table: MarkerTable, dictionary: cv2.aruco.Dictionary) -> None:
         self._table, self.cells = table, dictionary.markerSize + 2
         self._margin = np.array(table.margin_share, dtype=float, order="C")
-        self._white = np.zeros((len(table.ids), self.cells, self.cells), dtype=np.uint8)
+        self.white = np.zeros((len(table.ids), self.cells, self.cells), dtype=np.uint8)
         # Ids beyond the dictionary are never seen: they stay black, without contrast.
         for row in np.flatnonzero(table.ids < len(dictionary.bytesList)).tolist():
             code = dictionary.bytesList[table.ids[row] : table.ids[row] + 1]
             bits = cv2.aruco.Dictionary.getBitsFromByteList(code, dictionary.markerSize)
-            self._white[row, 1:-1, 1:-1] = bits
+            self.white[row, 1:-1, 1:-1] = bits
 
     def read(
         self,
@@ -97,7 +97,7 @@ class CellReader:
             c_void_p(image.ctypes.data), c_int64(image.shape[0]), c_int64(image.shape[1]),
             (c_double * 4)(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
             lens, byref(LIMITS), address(surface), address(position),
-            address(self._margin), c_int64(m), address(self._white), c_int64(self.cells),
+            address(self._margin), c_int64(m), address(self.white), c_int64(self.cells),
             address(skip), c_int64(reach), address(px), address(finest), address(found),
         )  # fmt: skip
         return ReadMarkers(px, finest, np.flatnonzero(found > LEAST_CORRELATION))

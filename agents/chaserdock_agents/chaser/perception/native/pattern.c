@@ -1,0 +1,294 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* Fits the corners of a small marker to the grey levels of all its cells. Method:
+ * chaserdock_agents.chaser.perception.pattern. */
+#include "lens.h"
+
+/* Capacity: pixels of a marker with what is used of its white border: 64 x 64. */
+#define PATTERN_PIXELS 4096
+/* Capacity: cells along a side; OpenCV's dictionaries have up to 10. */
+#define CELLS_MOST 16
+/* Unknowns: white, depth of black; blur; displacement; rise beyond each end of the border. */
+#define LEVELS 2
+#define SHAPES 8
+#define ENDS 4
+#define PATTERN_UNKNOWNS (LEVELS + 1 + SHAPES + ENDS)
+
+/* Settings, in the order of the Python caller; see pattern.py for each. */
+typedef struct {
+    double log_sigma, sigma_spread, clear_px, beyond_px, least_explained, max_move_px, min_contrast,
+        rounds, iterations;
+} PatternSettings;
+LAYOUT(PatternSettings, log_sigma, sigma_spread, clear_px, beyond_px, least_explained, max_move_px,
+       min_contrast, rounds, iterations)
+
+/* Pixels of a marker: coordinates of the marker in work, grey level. */
+typedef struct {
+    int count;
+    double x[PATTERN_PIXELS], y[PATTERN_PIXELS], level[PATTERN_PIXELS];
+} Patch;
+
+/* A place on a marker by a pixel: coordinates, 0 to 1 from side to side, and their gradients. */
+typedef struct {
+    double at[2], by[2][2];
+} Place;
+
+/* Inverse, up to a factor, of the homography of the unit square to corners. */
+static void to_square(const double *c, double *inverse) {
+    double h[9], column[3][3];
+    square_homography(c, h);
+    for (int i = 0; i < 9; i++) column[i % 3][i / 3] = h[i];
+    for (int i = 0; i < 3; i++) cross3(column[(i + 1) % 3], column[(i + 2) % 3], inverse + 3 * i);
+}
+
+static Place place_of(const double *inverse, double x, double y) {
+    double pixel[3] = {x, y, 1.0}, q[3];
+    Place p;
+    multiply3(inverse, pixel, q);
+    for (int k = 0; k < 2; k++) {
+        p.at[k] = q[k] / q[2];
+        for (int j = 0; j < 2; j++)
+            p.by[k][j] = (inverse[3 * k + j] - p.at[k] * inverse[6 + j]) / q[2];
+    }
+    return p;
+}
+
+/* How far beyond the sides pixels are used, as a share of the side, at a gradient by pixels. */
+static double used_share(const PatternSettings *set, double margin, int outlined, double gradient) {
+    double share = margin + (outlined ? set->beyond_px : -set->clear_px) * gradient;
+    return max_of(share, 0.0);
+}
+
+static double steepness(const Place *p, int k) {
+    return sqrt_of(p->by[k][0] * p->by[k][0] + p->by[k][1] * p->by[k][1]);
+}
+
+/* Collects the pixels of a marker. Returns whether there is room for all. */
+static int collect_patch(const Image *p, const PatternSettings *set, const double *corners,
+                         double margin, int outlined, Patch *patch) {
+    double inverse[9], h[9], low[2] = {1e300, 1e300}, high[2] = {-1e300, -1e300};
+    int64_t sizes[2] = {p->width, p->height}, from[2], to[2];
+    double share = min_of(margin + (outlined ? 0.25 : 0.0), 0.5);
+    double shift[2] = {0.0};
+    square_homography(corners, h);
+    to_square(corners, inverse);
+    if (p->lens) {
+        double centre[2], seen[2];
+        on_square(h, 0.5, 0.5, centre);
+        copy(centre, seen, 2);
+        distort(p, seen, seen + 1);
+        for (int k = 0; k < 2; k++) shift[k] = seen[k] - centre[k];
+    }
+    for (int i = 0; i < 4; i++) { /* of the marker with its border, in the image */
+        double seen[2];
+        on_square(h, i == 1 || i == 2 ? 1.0 + share : -share, i >= 2 ? 1.0 + share : -share, seen);
+        if (p->lens) distort(p, seen, seen + 1);
+        for (int k = 0; k < 2; k++) {
+            if (!finite(seen[k])) return 0;
+            low[k] = min_of(low[k], seen[k]), high[k] = max_of(high[k], seen[k]);
+        }
+    }
+    for (int k = 0; k < 2; k++) {
+        from[k] = (int64_t)min_of(max_of(low[k], 0.0), 1e6);
+        to[k] = (int64_t)min_of(max_of(high[k] + 1.0, 0.0), (double)sizes[k]);
+    }
+    patch->count = 0;
+    for (int64_t row = from[1]; row < to[1]; row++)
+        for (int64_t column = from[0]; column < to[0]; column++) {
+            double pixel[2] = {(double)column, (double)row}, q[2];
+            undistort_near(p, pixel, shift, q);
+            Place at = place_of(inverse, q[0], q[1]);
+            int inside = 1;
+            for (int k = 0; k < 2; k++) {
+                double most = used_share(set, margin, outlined, steepness(&at, k));
+                inside &= at.at[k] >= -most && at.at[k] <= 1.0 + most;
+            }
+            if (!inside) continue;
+            if (patch->count == PATTERN_PIXELS) return 0;
+            int n = patch->count++;
+            patch->x[n] = q[0], patch->y[n] = q[1];
+            patch->level[n] = (double)p->image[row * p->width + column];
+        }
+    return 1;
+}
+
+/* Share of strips along one axis, blurred by `sigma`, at a place, with its derivatives by that and
+ * by the logarithm of sigma. Strips begin at `first + i * width`, i < `count`. */
+static void strips_at(const Edge *edge, double at, double sigma, double first, double width,
+                      int count, double (*share)[3]) {
+    double last[3] = {0.0}, next[3];
+    for (int i = 0; i <= count; i++) {
+        double z = (at - (first + i * width)) / sigma, density;
+        edge_at(edge, z, next, &density);
+        next[1] = density / sigma, next[2] = -z * density;
+        for (int k = 0; k < 3 && i > 0; k++) share[i - 1][k] = last[k] - next[k];
+        copy(next, last, 3);
+    }
+}
+
+/* Value of an image that is a sum of products of strips along both axes, with its derivatives by
+ * both places and by the blur. */
+static void add_product(const double *a, const double *b, double *out) {
+    out[0] += a[0] * b[0];
+    out[1] += a[1] * b[0];
+    out[2] += a[0] * b[1];
+    out[3] += a[2] * b[0] + a[0] * b[2];
+}
+
+/* The pattern of a marker at a place: share of black, and with a border that ends (`outlined`) of
+ * what is beyond its four ends, each with derivatives by both coordinates and by the logarithm of
+ * the blur. */
+static void pattern_at(const Edge *edge, const Place *p, double sigma, double margin, int outlined,
+                       const uint8_t *white, int cells, double *black, double (*beyond)[4]) {
+    double share[2][CELLS_MOST][3], whole[2][1][3];
+    int from[2], to[2];
+    zero(black, 4);
+    for (int k = 0; k < 2; k++) {
+        double blur = sigma * steepness(p, k), reach = LAST * blur;
+        /* Strips within reach of the blur: others have no share. */
+        from[k] = (int)min_of(max_of((p->at[k] - reach) * cells, 0.0), cells);
+        to[k] = (int)min_of(max_of((p->at[k] + reach) * cells + 1.0, 0.0), cells);
+        strips_at(edge, p->at[k], blur, (double)from[k] / cells, 1.0 / cells, to[k] - from[k],
+                  share[k]);
+        strips_at(edge, p->at[k], blur, -margin, 1.0 + 2.0 * margin, 1, whole[k]);
+    }
+    for (int j = from[1]; j < to[1]; j++) {
+        double row[3] = {0.0};
+        for (int i = from[0]; i < to[0]; i++)
+            for (int k = 0; k < 3 && !white[j * cells + i]; k++) row[k] += share[0][i - from[0]][k];
+        add_product(row, share[1][j - from[1]], black);
+    }
+    zero(beyond[0], 4 * ENDS);
+    for (int i = 0; i < ENDS && outlined; i++) {
+        const double every[3] = {1.0, 0.0, 0.0};
+        double end[1][3];
+        int k = i / 2;
+        strips_at(edge, p->at[k], sigma * steepness(p, k), i % 2 ? 1.0 + margin : -margin - 100.0,
+                  100.0, 1, end);
+        if (k) add_product(whole[0][0], end[0], beyond[i]);
+        else add_product(end[0], every, beyond[i]);
+    }
+}
+
+/* Displacement of the image by infinitesimal homographies, at a place relative to a marker's centre
+ * in units of half its size. */
+static void displacements(double x, double y, double (*by)[2]) {
+    const double one[SHAPES][2] = {{1.0, 0.0}, {x, 0.0}, {y, 0.0}, {0.0, 1.0},
+                                   {0.0, x},   {0.0, y}, {x * x, x * y}, {x * y, y * y}};
+    for (int i = 0; i < SHAPES; i++)
+        for (int k = 0; k < 2; k++) by[i][k] = one[i][k];
+}
+
+/* Fits the corners of a marker to its pixels: white - depth * black, and, if the border ends on
+ * all sides (`outlined`), a level of its own beyond each end. Returns the share of the pixels' variance that is explained, 0 if
+ * it cannot be fitted; `covariance` (8, 8) of the corners for independent pixels. */
+static double fit_patch(const PatternSettings *set, const Edge *edge, const Patch *patch,
+                        double margin, int outlined, const uint8_t *white, int cells,
+                        double *corners, double *covariance) {
+    double levels[PATTERN_UNKNOWNS] = {0.0}, log_sigma = set->log_sigma, normal[PATTERN_UNKNOWNS * PATTERN_UNKNOWNS];
+    double prior = (2.0 / set->sigma_spread) * (2.0 / set->sigma_spread), explained = 0.0;
+    double centre[2], half = 0.0, variance = 0.0;
+    const int ends = outlined ? ENDS : 0, beyond_at = PATTERN_UNKNOWNS - ENDS, n = beyond_at + ends;
+    for (int k = 0; k < 2; k++)
+        centre[k] = 0.25 * ((corners[k] + corners[2 + k]) + (corners[4 + k] + corners[6 + k]));
+    for (int i = 0; i < 8; i++) half = max_of(half, abs_of(corners[i] - centre[i & 1]));
+    if (!(half > 0.5) || patch->count <= 2 * n) return 0.0;
+    double at_corner[4][SHAPES][2];
+    for (int i = 0; i < 4; i++)
+        displacements((corners[2 * i] - centre[0]) / half, (corners[2 * i + 1] - centre[1]) / half,
+                      at_corner[i]);
+    for (int step = 0; step <= (int)set->iterations; step++) {
+        double inverse[9], a[PATTERN_UNKNOWNS * PATTERN_UNKNOWNS] = {0.0}, b[PATTERN_UNKNOWNS] = {0.0};
+        double sum = 0.0, square = 0.0, left = 0.0, sigma = exponential(log_sigma);
+        to_square(corners, inverse);
+        for (int i = 0; i < patch->count; i++) {
+            double black[4], beyond[ENDS][4], row[PATTERN_UNKNOWNS], by[SHAPES][2], slope[2];
+            double gradient[3], residual = patch->level[i] - levels[0];
+            Place p = place_of(inverse, patch->x[i], patch->y[i]);
+            pattern_at(edge, &p, sigma, margin, outlined, white, cells, black, beyond);
+            row[0] = 1.0, row[1] = -black[0];
+            residual += levels[1] * black[0];
+            for (int k = 0; k < 3; k++) gradient[k] = -levels[1] * black[1 + k];
+            for (int e = 0; e < ends; e++) {
+                row[beyond_at + e] = beyond[e][0];
+                residual -= levels[beyond_at + e] * beyond[e][0];
+                for (int k = 0; k < 3; k++) gradient[k] += levels[beyond_at + e] * beyond[e][1 + k];
+            }
+            for (int k = 0; k < 2; k++)
+                slope[k] = -(gradient[0] * p.by[0][k] + gradient[1] * p.by[1][k]);
+            row[LEVELS] = gradient[2];
+            displacements((patch->x[i] - centre[0]) / half, (patch->y[i] - centre[1]) / half, by);
+            for (int k = 0; k < SHAPES; k++)
+                row[LEVELS + 1 + k] = slope[0] * by[k][0] + slope[1] * by[k][1];
+            add_row(row, residual, 1.0, n, a, b);
+            left += residual * residual;
+            sum += patch->level[i], square += patch->level[i] * patch->level[i];
+        }
+        double total = square - sum * sum / patch->count;
+        explained = total > 0.0 ? 1.0 - left / total : 0.0;
+        variance = left / (patch->count - n);
+        a[(n + 1) * LEVELS] += prior;
+        b[LEVELS] += prior * (set->log_sigma - log_sigma);
+        copy(a, normal, n * n);
+        if (step == (int)set->iterations) break;
+        if (!solve_normal(a, b, n)) return 0.0;
+        for (int k = 0; k < n; k++) levels[k] += k < LEVELS || k >= beyond_at ? b[k] : 0.0;
+        log_sigma = set->log_sigma + limited(log_sigma + limited(b[LEVELS], 0.2) - set->log_sigma, 1.0);
+        double most = 1e-300;
+        for (int k = 0; k < SHAPES; k++) most = max_of(most, abs_of(b[LEVELS + 1 + k]));
+        double share = min_of(1.0 / most, 1.0);
+        for (int i = 0; i < 8; i++)
+            for (int k = 0; k < SHAPES; k++)
+                corners[i] += share * b[LEVELS + 1 + k] * at_corner[i / 2][k][i & 1];
+        if (step > 0 && most < 1e-3) step = (int)set->iterations - 1;
+    }
+    if (!(levels[1] >= set->min_contrast) || !all_finite(corners, 8)) return 0.0;
+    double inverse[SHAPES][SHAPES];
+    for (int k = 0; k < SHAPES; k++) {
+        double a[PATTERN_UNKNOWNS * PATTERN_UNKNOWNS], b[PATTERN_UNKNOWNS] = {0.0};
+        copy(normal, a, n * n);
+        b[LEVELS + 1 + k] = 1.0;
+        if (!solve_normal(a, b, n)) return 0.0;
+        copy(b + LEVELS + 1, inverse[k], SHAPES);
+    }
+    for (int i = 0; i < 8; i++)
+        for (int j = 0; j < 8; j++) {
+            double total = 0.0;
+            for (int k = 0; k < SHAPES; k++)
+                for (int l = 0; l < SHAPES; l++)
+                    total += at_corner[i / 2][k][i & 1] * inverse[k][l] * at_corner[j / 2][l][j & 1];
+            covariance[8 * i + j] = variance * total;
+        }
+    return all_finite(covariance, 64) ? explained : 0.0;
+}
+
+/* Fits the corners (n, 4, 2) of markers in place, in their frames as for `refine_corners`, to the
+ * grey levels of their cells: `white` (n, cells, cells), 1 for white ones. `margin`, `outlined`: as
+ * there. `explained` (n): share of the variance of the pixels that the pattern explains; 0, with
+ * corners unchanged, for those that are not found. `covariance` (n, 8, 8): of found corners, px^2,
+ * for independent pixels. */
+EXPORT void NAME(fit_patterns)(const uint8_t *image, int64_t height, int64_t width,
+                               const double *camera, const Lens *lens, const double *frames,
+                               const uint8_t *framed, const PatternSettings *set, int64_t cells,
+                               int64_t n, const double *margin, const uint8_t *outlined,
+                               const uint8_t *white, double *corners, double *explained,
+                               double *covariance) {
+    Image p = {image, height, width, camera, lens, NULL};
+    Edge edge;
+    Patch patch;
+    tabulate(&edge);
+    for (int64_t m = 0; m < n; m++) {
+        double *given = corners + 8 * m, fitted[8], found = cells <= CELLS_MOST ? 1.0 : 0.0;
+        p.frame = framed[m] ? frames + 9 * m : NULL;
+        copy(given, fitted, 8);
+        for (int round = 0; round < (int)set->rounds && found > 0.0; round++) {
+            found = 0.0;
+            if (all_finite(fitted, 8) && collect_patch(&p, set, fitted, margin[m], outlined[m], &patch))
+                found = fit_patch(set, &edge, &patch, margin[m], outlined[m],
+                                  white + m * cells * cells, (int)cells, fitted, covariance + 64 * m);
+        }
+        for (int i = 0; i < 8 && found > 0.0; i++)
+            if (!(abs_of(fitted[i] - given[i]) < set->max_move_px)) found = 0.0;
+        explained[m] = found >= set->least_explained ? found : 0.0;
+        if (explained[m] > 0.0) copy(fitted, given, 8);
+    }
+}

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit the corners of small markers to the grey levels of all their cells.
+
+With cells of a few pixels the line of a single side is easily drawn to an edge of an inner cell.
+Here the known cells, black border and white margin, blurred by lens and pixel, are compared with
+all pixels of a marker at once: Gauss-Newton over the homography, blur and levels. The arithmetic
+is in C (native/pattern.c).
+"""
+
+from __future__ import annotations
+
+from ctypes import Structure, byref, c_double, c_int64, c_void_p
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_models.camera import Camera
+from chaserdock_models.native import address
+from numpy.typing import NDArray
+
+from .corners import SETTINGS, CornerErrors, Refined, mean_side_px
+from .lens import MarkerFrames, native_lens, strong_stretch
+from .native import LIBRARY, function
+
+SMALL_CELL_PX = 5.0
+"""Width of a cell, px, of the markers that are fitted so."""
+
+
+@LIBRARY.structure("PatternSettings")
+class _PatternSettings(Structure):
+    """Mirror `PatternSettings` of native/pattern.c."""
+
+    _fields_ = [
+        (name, c_double) for name in (
+            # Prior of the blur: as for sides (`corners.SETTINGS`).
+            "log_sigma", "sigma_spread",
+            # Length before the end of a white border up to which pixels are used, px; length beyond
+            # it if it ends there on all sides.
+            "clear_px", "beyond_px",
+            # Least share of the variance of the pixels that the pattern explains; largest
+            # correction of a corner, px; least contrast, grey levels.
+            "least_explained", "max_move_px", "min_contrast",
+            "rounds", "iterations",
+        )
+    ]  # fmt: skip
+
+
+_SETTINGS = _PatternSettings(
+    SETTINGS.log_edge_sigma, SETTINGS.edge_sigma_spread,
+    1.0, 1.5,
+    0.8, SETTINGS.max_move_px, SETTINGS.min_contrast,
+    2, 8,
+)  # fmt: skip
+
+INFLATION = 1.0
+FLOOR_PX = 0.0
+
+
+def are_small(camera: Camera, corners_ideal_px: Array, cells: int) -> NDArray[np.bool_]:
+    """Return which markers (n, 4, 2) have cells narrower than `SMALL_CELL_PX` in the image."""
+    side_px = mean_side_px(corners_ideal_px) / strong_stretch(camera, corners_ideal_px.mean(axis=1))
+    return side_px < SMALL_CELL_PX * cells
+
+
+def fit(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    corners_ideal_px: Array,
+    white: NDArray[np.uint8],
+    margin_share: Array,
+    outlined: NDArray[np.bool_],
+) -> tuple[Refined, Array]:
+    """Fit the corners of n markers, and return which share of the variance of their pixels is
+    explained (n,), 0 where a marker is not found.
+
+    Arguments as for `corners.refine`; ``white`` (n, cells, cells): 1 for white cells.
+    """
+    frames, n = MarkerFrames.of(camera, corners_ideal_px), len(corners_ideal_px)
+    corners = np.array(frames.into(corners_ideal_px), dtype=float, order="C")
+    image, margin = np.ascontiguousarray(image), np.array(margin_share, dtype=float, order="C")
+    ends, white = np.array(outlined, dtype=np.uint8, order="C"), np.ascontiguousarray(white)
+    explained, covariance = np.zeros(n), np.tile(np.eye(8), (n, 1, 1))
+    function("fit_patterns")(
+        c_void_p(image.ctypes.data), c_int64(image.shape[0]), c_int64(image.shape[1]),
+        (c_double * 4)(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
+        byref(native_lens(camera)) if camera.distorts else None,
+        address(frames.to_ray), address(frames.framed), byref(_SETTINGS),
+        c_int64(white.shape[1]), c_int64(n), address(margin), address(ends), address(white),
+        address(corners), address(explained), address(covariance),
+    )  # fmt: skip
+    stated = INFLATION * covariance + FLOOR_PX**2 * np.eye(8)
+    own = np.linalg.inv(np.linalg.cholesky(stated))
+    errors = CornerErrors(frames.whitening_of(own, corners), np.zeros((n, 8)))
+    return Refined(frames.out_of(corners), explained > 0.0, errors), explained

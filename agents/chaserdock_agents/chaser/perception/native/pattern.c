@@ -11,6 +11,8 @@
 #define LEVELS 2
 #define SHAPES 8
 #define ENDS 4
+/* Terms of the series of a blurred corner; with five, 0.004 is left at a correlation of 0.8. */
+#define ORDERS 5
 #define PATTERN_UNKNOWNS (LEVELS + 1 + SHAPES + ENDS)
 
 /* Settings, in the order of the Python caller; see pattern.py for each. */
@@ -111,27 +113,34 @@ static int collect_patch(const Image *p, const PatternSettings *set, const doubl
     return 1;
 }
 
-/* Share of strips along one axis, blurred by `sigma`, at a place, with its derivatives by that and
- * by the logarithm of sigma. Strips begin at `first + i * width`, i < `count`. */
+/* What strips along one axis are, blurred by `sigma`, at a place: their share of the blur, and its
+ * derivatives by it, as the terms of `add_product`. They begin at `first + i * width`, i < `count`. */
 static void strips_at(const Edge *edge, double at, double sigma, double first, double width,
-                      int count, double (*share)[3]) {
-    double last[3] = {0.0}, next[3];
+                      int count, double (*share)[ORDERS]) {
+    double last[ORDERS] = {0.0}, next[ORDERS];
     for (int i = 0; i <= count; i++) {
-        double z = (at - (first + i * width)) / sigma, density;
-        edge_at(edge, z, next, &density);
-        next[1] = density / sigma, next[2] = -z * density;
-        for (int k = 0; k < 3 && i > 0; k++) share[i - 1][k] = last[k] - next[k];
-        copy(next, last, 3);
+        double z = (at - (first + i * width)) / sigma;
+        edge_at(edge, z, next, next + 1);
+        next[2] = z * next[1];
+        for (int n = 3; n < ORDERS; n++) next[n] = z * next[n - 1] - (n - 2) * next[n - 2];
+        for (int n = 0; n < ORDERS && i > 0; n++) share[i - 1][n] = last[n] - next[n];
+        copy(next, last, ORDERS);
     }
 }
 
-/* Value of an image that is a sum of products of strips along both axes, with its derivatives by
- * both places and by the blur. */
-static void add_product(const double *a, const double *b, double *out) {
-    out[0] += a[0] * b[0];
-    out[1] += a[1] * b[0];
-    out[2] += a[0] * b[1];
-    out[3] += a[2] * b[0] + a[0] * b[2];
+/* Adds what a strip along one axis and one along the other have in common, blurred with a
+ * `correlation` between the axes, as the marker is seen askew: value, derivatives by both places in
+ * sigmas, and by the logarithm of the blur. The series is that of the normal distribution of two
+ * variables (M. G. Kendall, Biometrika, 1941), derivatives are to first order. */
+static void add_product(const double *a, const double *b, double correlation, double *out) {
+    double factor = 1.0;
+    for (int n = 0; n < ORDERS; n++) {
+        out[0] += factor * a[n] * b[n];
+        factor *= correlation / (n + 1.0);
+    }
+    out[1] += a[1] * b[0] - correlation * a[2] * b[1];
+    out[2] += a[0] * b[1] - correlation * a[1] * b[2];
+    out[3] += 2.0 * correlation * a[1] * b[1] - a[2] * b[0] - a[0] * b[2];
 }
 
 /* The pattern of a marker at a place: share of black, and with a border that ends (`outlined`) of
@@ -139,11 +148,11 @@ static void add_product(const double *a, const double *b, double *out) {
  * the blur. */
 static void pattern_at(const Edge *edge, const Place *p, double sigma, double margin, int outlined,
                        const uint8_t *white, int cells, double *black, double (*beyond)[4]) {
-    double share[2][CELLS_MOST][3], whole[2][1][3];
+    double share[2][CELLS_MOST][ORDERS], whole[2][1][ORDERS], blurs[2];
     int from[2], to[2];
     zero(black, 4);
     for (int k = 0; k < 2; k++) {
-        double blur = sigma * steepness(p, k), reach = LAST * blur;
+        double blur = blurs[k] = sigma * steepness(p, k), reach = LAST * blur;
         /* Strips within reach of the blur: others have no share. */
         from[k] = (int)min_of(max_of((p->at[k] - reach) * cells, 0.0), cells);
         to[k] = (int)min_of(max_of((p->at[k] + reach) * cells + 1.0, 0.0), cells);
@@ -151,21 +160,27 @@ static void pattern_at(const Edge *edge, const Place *p, double sigma, double ma
                   share[k]);
         strips_at(edge, p->at[k], blur, -margin, 1.0 + 2.0 * margin, 1, whole[k]);
     }
+    double askew = (p->by[0][0] * p->by[1][0] + p->by[0][1] * p->by[1][1]) /
+                   (steepness(p, 0) * steepness(p, 1));
     for (int j = from[1]; j < to[1]; j++) {
-        double row[3] = {0.0};
+        double row[ORDERS] = {0.0};
         for (int i = from[0]; i < to[0]; i++)
-            for (int k = 0; k < 3 && !white[j * cells + i]; k++) row[k] += share[0][i - from[0]][k];
-        add_product(row, share[1][j - from[1]], black);
+            for (int n = 0; n < ORDERS && !white[j * cells + i]; n++)
+                row[n] += share[0][i - from[0]][n];
+        add_product(row, share[1][j - from[1]], askew, black);
     }
     zero(beyond[0], 4 * ENDS);
     for (int i = 0; i < ENDS && outlined; i++) {
-        const double every[3] = {1.0, 0.0, 0.0};
-        double end[1][3];
+        const double every[ORDERS] = {1.0};
+        double end[1][ORDERS];
         int k = i / 2;
-        strips_at(edge, p->at[k], sigma * steepness(p, k), i % 2 ? 1.0 + margin : -margin - 100.0,
-                  100.0, 1, end);
-        if (k) add_product(whole[0][0], end[0], beyond[i]);
-        else add_product(end[0], every, beyond[i]);
+        strips_at(edge, p->at[k], blurs[k], i % 2 ? 1.0 + margin : -margin - 100.0, 100.0, 1, end);
+        if (k) add_product(whole[0][0], end[0], askew, beyond[i]);
+        else add_product(end[0], every, askew, beyond[i]);
+    }
+    for (int k = 0; k < 2; k++) {
+        black[1 + k] /= blurs[k];
+        for (int i = 0; i < ENDS; i++) beyond[i][1 + k] /= blurs[k];
     }
 }
 

@@ -33,9 +33,9 @@ class _PatternSettings(Structure):
         (name, c_double) for name in (
             # Prior of the blur: as for sides (`corners.SETTINGS`).
             "log_sigma", "sigma_spread",
-            # Length before the end of a white border up to which pixels are used, px; length beyond
-            # it if it ends there on all sides.
-            "clear_px", "beyond_px",
+            # Length before the end of a white border up to which pixels are used, px, if it does
+            # not end there on all sides.
+            "clear_px",
             # Least share of the variance of the pixels that the pattern explains; largest
             # correction of a corner, px; least contrast, grey levels.
             "least_explained", "max_move_px", "min_contrast",
@@ -46,7 +46,7 @@ class _PatternSettings(Structure):
 
 _SETTINGS = _PatternSettings(
     SETTINGS.log_edge_sigma, SETTINGS.edge_sigma_spread,
-    1.0, 1.5,
+    1.0,
     0.8, SETTINGS.max_move_px, SETTINGS.min_contrast,
     2, 8,
 )  # fmt: skip

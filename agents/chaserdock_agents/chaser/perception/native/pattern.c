@@ -17,10 +17,10 @@
 
 /* Settings, in the order of the Python caller; see pattern.py for each. */
 typedef struct {
-    double log_sigma, sigma_spread, clear_px, beyond_px, least_explained, max_move_px, min_contrast,
-        rounds, iterations;
+    double log_sigma, sigma_spread, clear_px, least_explained, max_move_px, min_contrast, rounds,
+        iterations;
 } PatternSettings;
-LAYOUT(PatternSettings, log_sigma, sigma_spread, clear_px, beyond_px, least_explained, max_move_px,
+LAYOUT(PatternSettings, log_sigma, sigma_spread, clear_px, least_explained, max_move_px,
        min_contrast, rounds, iterations)
 
 /* Pixels of a marker: coordinates of the marker in work, grey level. */
@@ -56,8 +56,7 @@ static Place place_of(const double *inverse, double x, double y) {
 
 /* How far beyond the sides pixels are used, as a share of the side, at a gradient by pixels. */
 static double used_share(const PatternSettings *set, double margin, int outlined, double gradient) {
-    double share = margin + (outlined ? set->beyond_px : -set->clear_px) * gradient;
-    return max_of(share, 0.0);
+    return outlined ? margin : max_of(margin - set->clear_px * gradient, 0.0);
 }
 
 static double steepness(const Place *p, int k) {
@@ -69,7 +68,7 @@ static int collect_patch(const Image *p, const PatternSettings *set, const doubl
                          double margin, int outlined, Patch *patch) {
     double inverse[9], h[9], low[2] = {1e300, 1e300}, high[2] = {-1e300, -1e300};
     int64_t sizes[2] = {p->width, p->height}, from[2], to[2];
-    double share = min_of(margin + (outlined ? 0.25 : 0.0), 0.5);
+    double share = min_of(margin, 0.5);
     double shift[2] = {0.0};
     square_homography(corners, h);
     to_square(corners, inverse);

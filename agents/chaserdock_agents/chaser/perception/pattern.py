@@ -33,32 +33,39 @@ class _PatternSettings(Structure):
         (name, c_double) for name in (
             # Prior of the blur: as for sides (`corners.SETTINGS`).
             "log_sigma", "sigma_spread",
-            # Length before the end of a white border up to which pixels are used, px, if it does
-            # not end there on all sides.
-            "clear_px",
+            # Of a white border that does not end on all sides where it is said to: length before
+            # its end from which on pixels are not used, and largest used width, px.
+            "clear_px", "reach_px",
             # Least share of the variance of the pixels that the pattern explains; largest
             # correction of a corner, px; least contrast, grey levels.
             "least_explained", "max_move_px", "min_contrast",
-            "rounds", "iterations",
+            # Largest correction after which the fit has settled, px; most iterations.
+            "settled_px", "iterations",
         )
     ]  # fmt: skip
 
 
 _SETTINGS = _PatternSettings(
     SETTINGS.log_edge_sigma, SETTINGS.edge_sigma_spread,
-    1.0,
-    0.8, SETTINGS.max_move_px, SETTINGS.min_contrast,
-    2, 8,
+    1.0, 2.5,
+    0.85, SETTINGS.max_move_px, SETTINGS.min_contrast,
+    0.05, 8,
 )  # fmt: skip
 
-INFLATION = 1.0
-FLOOR_PX = 0.0
+LEAST_SIGMA_PX = 0.004
+ENOUGH = 8
 
 
-def are_small(camera: Camera, corners_ideal_px: Array, cells: int) -> NDArray[np.bool_]:
-    """Return which markers (n, 4, 2) have cells narrower than `SMALL_CELL_PX` in the image."""
+def which_to_fit(
+    camera: Camera, corners_ideal_px: Array, cells: int, known: int = 0
+) -> NDArray[np.intp]:
+    """Return the markers (n, 4, 2) to be fitted so: small ones, the largest first, as many as
+    larger and ``known`` ones leave of `ENOUGH`.
+    """
     side_px = mean_side_px(corners_ideal_px) / strong_stretch(camera, corners_ideal_px.mean(axis=1))
-    return side_px < SMALL_CELL_PX * cells
+    small = np.flatnonzero(side_px < SMALL_CELL_PX * cells)
+    left = max(ENOUGH - known - (len(side_px) - len(small)), 0)
+    return small[np.argsort(-side_px[small], kind="stable")[:left]]
 
 
 def fit(
@@ -68,9 +75,8 @@ def fit(
     white: NDArray[np.uint8],
     margin_share: Array,
     outlined: NDArray[np.bool_],
-) -> tuple[Refined, Array]:
-    """Fit the corners of n markers, and return which share of the variance of their pixels is
-    explained (n,), 0 where a marker is not found.
+) -> Refined:
+    """Fit the corners of n markers; those whose pixels are not explained are not good.
 
     Arguments as for `corners.refine`; ``white`` (n, cells, cells): 1 for white cells.
     """
@@ -87,7 +93,7 @@ def fit(
         c_int64(white.shape[1]), c_int64(n), address(margin), address(ends), address(white),
         address(corners), address(explained), address(covariance),
     )  # fmt: skip
-    stated = INFLATION * covariance + FLOOR_PX**2 * np.eye(8)
+    stated = covariance + LEAST_SIGMA_PX**2 * np.eye(8)
     own = np.linalg.inv(np.linalg.cholesky(stated))
     errors = CornerErrors(frames.whitening_of(own, corners), np.zeros((n, 8)))
-    return Refined(frames.out_of(corners), explained > 0.0, errors), explained
+    return Refined(frames.out_of(corners), explained > 0.0, errors)

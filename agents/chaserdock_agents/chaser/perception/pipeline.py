@@ -95,7 +95,7 @@ class _Further:
         new = ~np.isin(coarse, used)
         coarse, px, errors = coarse[new], px[new], errors.part(new)
         if len(rows):
-            refined = by.refined(self._image, read.corners_px[rows], rows)
+            refined = by.refined(self._image, read.corners_px[rows], rows, len(used))
             rows = rows[refined.good]
             left = ~np.isin(coarse, rows)  # a fitted marker replaces a coarse one
             fitted = refined.part(refined.good)
@@ -217,22 +217,22 @@ class Perception:
         return self._sighting(found.ids, solutions, self.table.ids[rows[used]], px[used])
 
     def refined(
-        self, image: NDArray[np.uint8], px: Array, rows: NDArray[np.intp]
+        self, image: NDArray[np.uint8], px: Array, rows: NDArray[np.intp], known: int = 0
     ) -> corners.Refined:
         """Return the corners of markers, refined by all cells of small ones, by the sides of
         others; ``px`` (n, 4, 2), ideal: where they are to about two pixels.
         """
         margin, outlined = self.table.margin_share[rows], self.table.outlined[rows]
         refined = corners.refine(image, self.camera, px, self.reader.cells, margin, outlined)
-        small = pattern.are_small(self.camera, px, self.reader.cells)
-        if not small.any():
-            return refined
-        start, rows, margin, outlined = px[small], rows[small], margin[small], outlined[small]
-        white, by_sides = self.reader.white[rows], refined.part(small)
-        fitted, explained = pattern.fit(image, self.camera, by_sides.corners_px, white, margin, outlined)
-        other, better = pattern.fit(image, self.camera, start, white, margin, outlined)
-        fitted = fitted.with_others(which := better > explained, other.part(which))
-        return refined.with_others(small, fitted)
+        which = pattern.which_to_fit(self.camera, px, self.reader.cells, known)
+        for start in (refined.corners_px, px):  # by sides, and as they were found
+            if not len(which):
+                break
+            white, at = self.reader.white[rows[which]], start[which]
+            fitted = pattern.fit(image, self.camera, at, white, margin[which], outlined[which])
+            refined = refined.with_others(which, fitted)
+            which = which[~fitted.good]
+        return refined
 
     def _estimate_paper(self, image: NDArray[np.uint8]) -> PerceptionResult:
         found = paper.detect(image, self.camera, self._dictionary)

@@ -17,11 +17,11 @@
 
 /* Settings, in the order of the Python caller; see pattern.py for each. */
 typedef struct {
-    double log_sigma, sigma_spread, clear_px, least_explained, max_move_px, min_contrast, rounds,
-        iterations;
+    double log_sigma, sigma_spread, clear_px, reach_px, least_explained, max_move_px, min_contrast,
+        settled_px, iterations;
 } PatternSettings;
-LAYOUT(PatternSettings, log_sigma, sigma_spread, clear_px, least_explained, max_move_px,
-       min_contrast, rounds, iterations)
+LAYOUT(PatternSettings, log_sigma, sigma_spread, clear_px, reach_px, least_explained, max_move_px,
+       min_contrast, settled_px, iterations)
 
 /* Pixels of a marker: coordinates of the marker in work, grey level. */
 typedef struct {
@@ -56,7 +56,8 @@ static Place place_of(const double *inverse, double x, double y) {
 
 /* How far beyond the sides pixels are used, as a share of the side, at a gradient by pixels. */
 static double used_share(const PatternSettings *set, double margin, int outlined, double gradient) {
-    return outlined ? margin : max_of(margin - set->clear_px * gradient, 0.0);
+    return outlined ? margin
+                    : max_of(min_of(margin - set->clear_px * gradient, set->reach_px * gradient), 0.0);
 }
 
 static double steepness(const Place *p, int k) {
@@ -147,39 +148,38 @@ static void add_product(const double *a, const double *b, double correlation, do
  * the blur. */
 static void pattern_at(const Edge *edge, const Place *p, double sigma, double margin, int outlined,
                        const uint8_t *white, int cells, double *black, double (*beyond)[4]) {
-    double share[2][CELLS_MOST][ORDERS], whole[2][1][ORDERS], blurs[2];
+    double share[2][CELLS_MOST][ORDERS], blurs[2], steep[2] = {steepness(p, 0), steepness(p, 1)};
     int from[2], to[2];
     zero(black, 4);
     for (int k = 0; k < 2; k++) {
-        double blur = blurs[k] = sigma * steepness(p, k), reach = LAST * blur;
+        double blur = blurs[k] = sigma * steep[k], reach = LAST * blur;
         /* Strips within reach of the blur: others have no share. */
         from[k] = (int)min_of(max_of((p->at[k] - reach) * cells, 0.0), cells);
         to[k] = (int)min_of(max_of((p->at[k] + reach) * cells + 1.0, 0.0), cells);
         strips_at(edge, p->at[k], blur, (double)from[k] / cells, 1.0 / cells, to[k] - from[k],
                   share[k]);
-        strips_at(edge, p->at[k], blur, -margin, 1.0 + 2.0 * margin, 1, whole[k]);
     }
     double askew = (p->by[0][0] * p->by[1][0] + p->by[0][1] * p->by[1][1]) /
-                   (steepness(p, 0) * steepness(p, 1));
+                   (steep[0] * steep[1]);
     for (int j = from[1]; j < to[1]; j++) {
         double row[ORDERS] = {0.0};
-        for (int i = from[0]; i < to[0]; i++)
-            for (int n = 0; n < ORDERS && !white[j * cells + i]; n++)
-                row[n] += share[0][i - from[0]][n];
+        for (int i = from[0]; i < to[0]; i++) {
+            double dark = white[j * cells + i] ? 0.0 : 1.0;
+            for (int n = 0; n < ORDERS; n++) row[n] += dark * share[0][i - from[0]][n];
+        }
         add_product(row, share[1][j - from[1]], askew, black);
     }
+    for (int k = 0; k < 2; k++) black[1 + k] /= blurs[k];
+    if (!outlined) return;
+    const double every[ORDERS] = {1.0};
+    double end[1][ORDERS], within[1][ORDERS];
+    strips_at(edge, p->at[0], blurs[0], -margin, 1.0 + 2.0 * margin, 1, within);
     zero(beyond[0], 4 * ENDS);
-    for (int i = 0; i < ENDS && outlined; i++) {
-        const double every[ORDERS] = {1.0};
-        double end[1][ORDERS];
+    for (int i = 0; i < ENDS; i++) {
         int k = i / 2;
         strips_at(edge, p->at[k], blurs[k], i % 2 ? 1.0 + margin : -margin - 100.0, 100.0, 1, end);
-        if (k) add_product(whole[0][0], end[0], askew, beyond[i]);
-        else add_product(end[0], every, askew, beyond[i]);
-    }
-    for (int k = 0; k < 2; k++) {
-        black[1 + k] /= blurs[k];
-        for (int i = 0; i < ENDS; i++) beyond[i][1 + k] /= blurs[k];
+        add_product(k ? within[0] : end[0], k ? end[0] : every, askew, beyond[i]);
+        for (int j = 0; j < 2; j++) beyond[i][1 + j] /= blurs[j];
     }
 }
 
@@ -210,9 +210,17 @@ static double fit_patch(const PatternSettings *set, const Edge *edge, const Patc
     for (int i = 0; i < 4; i++)
         displacements((corners[2 * i] - centre[0]) / half, (corners[2 * i + 1] - centre[1]) / half,
                       at_corner[i]);
-    for (int step = 0; step <= (int)set->iterations; step++) {
+    double least = 255.0, sum = 0.0, square = 0.0, settled = 0.0;
+    for (int i = 0; i < patch->count; i++) {
+        levels[0] = max_of(levels[0], patch->level[i]), least = min_of(least, patch->level[i]);
+        sum += patch->level[i], square += patch->level[i] * patch->level[i];
+    }
+    levels[1] = levels[0] - least;
+    double total = square - sum * sum / patch->count;
+    for (int step = 0; step < (int)set->iterations && settled == 0.0; step++) {
         double inverse[9], a[PATTERN_UNKNOWNS * PATTERN_UNKNOWNS] = {0.0}, b[PATTERN_UNKNOWNS] = {0.0};
-        double sum = 0.0, square = 0.0, left = 0.0, sigma = exponential(log_sigma);
+        double right[PATTERN_UNKNOWNS];
+        double left = 0.0, sigma = exponential(log_sigma);
         to_square(corners, inverse);
         for (int i = 0; i < patch->count; i++) {
             double black[4], beyond[ENDS][4], row[PATTERN_UNKNOWNS], by[SHAPES][2], slope[2];
@@ -233,18 +241,19 @@ static double fit_patch(const PatternSettings *set, const Edge *edge, const Patc
             displacements((patch->x[i] - centre[0]) / half, (patch->y[i] - centre[1]) / half, by);
             for (int k = 0; k < SHAPES; k++)
                 row[LEVELS + 1 + k] = slope[0] * by[k][0] + slope[1] * by[k][1];
-            add_row(row, residual, 1.0, n, a, b);
+            if (ends) add_row(row, residual, 1.0, PATTERN_UNKNOWNS, a, b);
+            else add_row(row, residual, 1.0, PATTERN_UNKNOWNS - ENDS, a, b);
             left += residual * residual;
-            sum += patch->level[i], square += patch->level[i] * patch->level[i];
         }
-        double total = square - sum * sum / patch->count;
-        explained = total > 0.0 ? 1.0 - left / total : 0.0;
-        variance = left / (patch->count - n);
         a[(n + 1) * LEVELS] += prior;
         b[LEVELS] += prior * (set->log_sigma - log_sigma);
         copy(a, normal, n * n);
-        if (step == (int)set->iterations) break;
+        copy(b, right, n);
         if (!solve_normal(a, b, n)) return 0.0;
+        for (int k = 0; k < n; k++) left -= right[k] * b[k]; /* after the step, as far as linear */
+        left = max_of(left, 0.0);
+        explained = total > 0.0 ? 1.0 - left / total : 0.0;
+        variance = left / (patch->count - n);
         for (int k = 0; k < n; k++) levels[k] += k < LEVELS || k >= beyond_at ? b[k] : 0.0;
         log_sigma = set->log_sigma + limited(log_sigma + limited(b[LEVELS], 0.2) - set->log_sigma, 1.0);
         double most = 1e-300;
@@ -253,9 +262,9 @@ static double fit_patch(const PatternSettings *set, const Edge *edge, const Patc
         for (int i = 0; i < 8; i++)
             for (int k = 0; k < SHAPES; k++)
                 corners[i] += share * b[LEVELS + 1 + k] * at_corner[i / 2][k][i & 1];
-        if (step > 0 && most < 1e-3) step = (int)set->iterations - 1;
+        settled = most < set->settled_px ? 1.0 : 0.0;
     }
-    if (!(levels[1] >= set->min_contrast) || !all_finite(corners, 8)) return 0.0;
+    if (settled == 0.0 || !(levels[1] >= set->min_contrast) || !all_finite(corners, 8)) return 0.0;
     double inverse[SHAPES][SHAPES];
     for (int k = 0; k < SHAPES; k++) {
         double a[PATTERN_UNKNOWNS * PATTERN_UNKNOWNS], b[PATTERN_UNKNOWNS] = {0.0};
@@ -291,15 +300,13 @@ EXPORT void NAME(fit_patterns)(const uint8_t *image, int64_t height, int64_t wid
     Patch patch;
     tabulate(&edge);
     for (int64_t m = 0; m < n; m++) {
-        double *given = corners + 8 * m, fitted[8], found = cells <= CELLS_MOST ? 1.0 : 0.0;
+        double *given = corners + 8 * m, fitted[8], found = 0.0;
         p.frame = framed[m] ? frames + 9 * m : NULL;
         copy(given, fitted, 8);
-        for (int round = 0; round < (int)set->rounds && found > 0.0; round++) {
-            found = 0.0;
-            if (all_finite(fitted, 8) && collect_patch(&p, set, fitted, margin[m], outlined[m], &patch))
-                found = fit_patch(set, &edge, &patch, margin[m], outlined[m],
-                                  white + m * cells * cells, (int)cells, fitted, covariance + 64 * m);
-        }
+        if (cells <= CELLS_MOST && all_finite(fitted, 8) &&
+            collect_patch(&p, set, fitted, margin[m], outlined[m], &patch))
+            found = fit_patch(set, &edge, &patch, margin[m], outlined[m], white + m * cells * cells,
+                              (int)cells, fitted, covariance + 64 * m);
         for (int i = 0; i < 8 && found > 0.0; i++)
             if (!(abs_of(fitted[i] - given[i]) < set->max_move_px)) found = 0.0;
         explained[m] = found >= set->least_explained ? found : 0.0;

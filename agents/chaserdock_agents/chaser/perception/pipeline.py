@@ -102,6 +102,12 @@ class _Further:
             coarse = np.concatenate([rows, coarse[left]])
             px = np.concatenate([fitted.corners_px, px[left]])
             errors = fitted.errors.followed_by(errors.part(left))
+        if len(read.faint):
+            fitted = by.patterns(self._image, read.corners_px[read.faint], read.faint)
+            new = fitted.good & ~np.isin(read.faint, coarse)
+            coarse = np.concatenate([coarse, read.faint[new]])
+            px = np.concatenate([px, fitted.corners_px[new]])
+            errors = errors.followed_by(fitted.errors.part(new))
         before, count = len(self._rows), len(coarse)
         if reach:
             at = read.corners_px[read.rows]
@@ -228,11 +234,17 @@ class Perception:
         for start in (refined.corners_px, px):  # by sides, and as they were found
             if not len(which):
                 break
-            white, at = self.reader.white[rows[which]], start[which]
-            fitted = pattern.fit(image, self.camera, at, white, margin[which], outlined[which])
+            fitted = self.patterns(image, start[which], rows[which])
             refined = refined.with_others(which, fitted)
             which = which[~fitted.good]
         return refined
+
+    def patterns(
+        self, image: NDArray[np.uint8], px: Array, rows: NDArray[np.intp]
+    ) -> corners.Refined:
+        """Return the corners of small markers by all their cells; ``px`` as for `refined`."""
+        white, margin = self.reader.white[rows], self.table.margin_share[rows]
+        return pattern.fit(image, self.camera, px, white, margin, self.table.outlined[rows])
 
     def _estimate_paper(self, image: NDArray[np.uint8]) -> PerceptionResult:
         found = paper.detect(image, self.camera, self._dictionary)

@@ -29,6 +29,9 @@ cell: twice what poses of rendered far markers show. Smaller: such places outwei
 LEAST_CORRELATION = 0.7
 """Correlation of a marker's cells with those of its id, above which it is there: uniform noise in
 36 cells exceeds it once in 100,000, and once in 1,200 if 81 places are tried."""
+FAINT_CORRELATION = 0.35
+"""The same of a marker that may be there: blur takes so much of cells of a pixel. The fit of all
+its cells tells (`pattern`)."""
 
 
 @LIBRARY.structure("ReadLimits")
@@ -41,9 +44,9 @@ class _ReadLimits(Structure):
     ]  # fmt: skip
 
 
-# OpenCV reads no marker at a smaller cosine or with cells of less than a pixel; the sides need a
+# OpenCV reads no marker at a smaller cosine or with narrower cells; the sides need a
 # pixel beyond them; four places within the middle of a cell are sampled; contrast as for sides.
-LIMITS = _ReadLimits(0.08, 1.0, 1.0, 0.2, 8.0)
+LIMITS = _ReadLimits(0.08, 0.7, 1.0, 0.2, 8.0)
 
 
 @dataclass(frozen=True)
@@ -53,12 +56,13 @@ class ReadMarkers:
     ``corners_px`` (m, 4, 2): projected, ideal; of a marker that was looked for: where its cells
     correlate best. ``finest_px`` (m,): width of the finer of cell and
     border, NaN for a marker that does not face the camera. ``rows`` (k,): of those whose cells were
-    read.
+    read. ``faint`` (j,): of those that may be there.
     """
 
     corners_px: Array
     finest_px: Array
     rows: NDArray[np.intp]
+    faint: NDArray[np.intp]
 
 
 class CellReader:
@@ -100,4 +104,6 @@ class CellReader:
             address(self._margin), c_int64(m), address(self.white), c_int64(self.cells),
             address(skip), c_int64(reach), address(px), address(finest), address(found),
         )  # fmt: skip
-        return ReadMarkers(px, finest, np.flatnonzero(found > LEAST_CORRELATION))
+        rows = np.flatnonzero(found > LEAST_CORRELATION)
+        faint = np.flatnonzero((found > FAINT_CORRELATION) & (found <= LEAST_CORRELATION))
+        return ReadMarkers(px, finest, rows, faint)

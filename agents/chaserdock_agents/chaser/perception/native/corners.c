@@ -108,11 +108,12 @@ static void distort(const Image *p, double *x, double *y) {
     *y = seen[1] * l[1] + l[3];
 }
 
-/* Converts a pixel to coordinates of the marker in work: `shift` is by how much the lens shifts
- * points near it. */
-static void undistort_near(const Image *p, const double *pixel, const double *shift, double *q) {
+/* Converts a pixel to coordinates of the marker in work. `shift`: by how much the lens moves points
+ * near it; each step leaves what that changes by over the distance, at most 0.3 of it. */
+static void undistort_near(const Image *p, const double *pixel, const double *shift, int steps,
+                           double *q) {
     for (int j = 0; j < 2; j++) q[j] = pixel[j] - shift[j];
-    for (int i = 0; i < 2 && p->lens; i++) {
+    for (int i = 0; i < steps && p->lens; i++) {
         double d[2] = {q[0], q[1]};
         distort(p, d, d + 1);
         for (int j = 0; j < 2; j++) q[j] += pixel[j] - d[j];
@@ -361,7 +362,7 @@ static void collect(const Image *p, const Settings *set, const Side *s, const Bo
              row += 1.0) {
             double pixel[2], q[2];
             pixel[k] = line, pixel[o] = row;
-            undistort_near(p, pixel, shift, q);
+            undistort_near(p, pixel, shift, 2, q);
             double x = q[0] - s->start[0], y = q[1] - s->start[1];
             double offset = x * s->normal[0] + y * s->normal[1],
                    along = (x * s->vector[0] + y * s->vector[1]) / length;

@@ -97,7 +97,7 @@ static int collect_patch(const Image *p, const PatternSettings *set, const doubl
     for (int64_t row = from[1]; row < to[1]; row++)
         for (int64_t column = from[0]; column < to[0]; column++) {
             double pixel[2] = {(double)column, (double)row}, q[2];
-            undistort_near(p, pixel, shift, q);
+            undistort_near(p, pixel, shift, 6, q);
             Place at = place_of(inverse, q[0], q[1]);
             int inside = 1;
             for (int k = 0; k < 2; k++) {
@@ -281,6 +281,8 @@ static double fit_patch(const PatternSettings *set, const Edge *edge, const Patc
                     total += at_corner[i / 2][k][i & 1] * inverse[k][l] * at_corner[j / 2][l][j & 1];
             covariance[8 * i + j] = variance * total;
         }
+    for (int i = 0; i < 8; i++) /* as good as unknown */
+        if (!(covariance[9 * i] < set->max_move_px * set->max_move_px)) return 0.0;
     return all_finite(covariance, 64) ? explained : 0.0;
 }
 

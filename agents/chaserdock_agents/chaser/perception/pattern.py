@@ -25,9 +25,9 @@ SMALL_CELL_PX = 5.0
 """Width of a cell, px, below which markers are fitted so: the errors of corners are a sixth of
 those of sides with cells of 1 to 2 px, a quarter with 2 to 3, a half with 3 to 5. Wider: more time
 for less."""
-ENOUGH = 8
-"""Markers of an image, larger ones included, beyond which no further one is fitted so: two faces
-with four large markers each. More: time, 0.2 ms each."""
+ENOUGH = 6
+"""Markers in one image beyond which further ones hardly improve the pose: no further one is fitted
+so. More: time, 0.2 ms each."""
 LEAST_SIGMA_PX = 0.004
 """Standard deviation, px, of each coordinate beyond what the residuals of pixels tell: the NEES of
 poses from markers with cells of 3 to 5 px."""

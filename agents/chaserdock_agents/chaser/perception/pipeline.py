@@ -16,12 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from . import baseline as paper
 from . import corners, detect, pattern, pnp
 from .corners import CornerErrors
+from .pattern import ENOUGH
 from .pnp import FurtherMarkers, TargetPose
 from .reading import PLACE_CELLS, CellReader
 from .refine import PoseInCamera
-
-_ENOUGH = 6
-"""Markers in one image beyond which further ones hardly improve the pose."""
 
 Method = Literal["default", "paper", "paper_iterative"]
 
@@ -144,7 +142,7 @@ class Perception:
         self._dictionary = detect.dictionary_of(model.dictionary)
         self.table = pnp.MarkerTable.of(model)
         # Targets with many markers per face do not need the small ones that are lost at half size.
-        self._enough = _ENOUGH if len(model.markers) >= 6 * _ENOUGH else None
+        self._enough = ENOUGH if len(model.markers) >= 6 * ENOUGH else None
         self._rows = {int(i): row for row, i in enumerate(self.table.ids)}
         self.reader = CellReader(self.table, self._dictionary)
 

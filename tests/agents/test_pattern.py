@@ -7,8 +7,7 @@ import pytest
 from chaserdock_agents.chaser.perception import pattern
 from chaserdock_models.camera import Camera
 
-WHITE = np.array([[[0, 0, 0, 0, 0, 0], [0, 1, 0, 1, 1, 0], [0, 0, 0, 1, 0, 0],
-                   [0, 1, 1, 0, 1, 0], [0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 0, 0]]], dtype=np.uint8)  # fmt: skip
+WHITE = np.pad([[1, 0, 1, 1], [0, 0, 1, 0], [1, 1, 0, 1], [0, 1, 0, 0]], 1).astype(np.uint8)[None]
 CAMERA = Camera.from_hfov(64, 56, 0.1)
 QUADS = {
     "upright": [[20.3, 18.2], [38.1, 19.4], [37.2, 37.7], [19.1, 36.0]],
@@ -40,8 +39,9 @@ def image_of(quad, camera=CAMERA, outlined=True, noise=0.0, seed=0, blur_px=0.6)
     else:
         level[u > 1.0 + BORDER] = 30.0
     level = level.reshape(56 * fine, 64 * fine)
-    level = cv2.GaussianBlur(level, None, blur_px * fine).reshape(56, fine, 64, fine)
-    level = level.mean(axis=(1, 3)) + noise * np.random.default_rng(seed).normal(size=(56, 64))
+    level = np.asarray(cv2.GaussianBlur(level, (0, 0), blur_px * fine))
+    level = level.reshape(56, fine, 64, fine).mean(axis=(1, 3))
+    level += noise * np.random.default_rng(seed).normal(size=(56, 64))
     return np.clip(np.round(level), 0, 255).astype(np.uint8)
 
 

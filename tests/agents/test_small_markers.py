@@ -209,7 +209,9 @@ def test_markers_with_cells_of_a_pixel_are_read_by_the_blur_that_they_have():
     scene = Scene(target_model("servicer"))
     q = rotations.normalize([0.802, 0.0958, -0.4648, -0.3625])
     position = np.array([0.17062531, 0.15614545, 2.62794457])
-    ids = scene.perception.estimate(scene.image(position, q, light=(-0.057, 2.296, -0.178))).marker_ids
+    ids = scene.perception.estimate(
+        scene.image(position, q, light=(-0.057, 2.296, -0.178))
+    ).marker_ids
     assert 17 in ids
 
 

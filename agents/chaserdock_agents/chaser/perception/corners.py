@@ -140,7 +140,9 @@ class CornerErrors:
             np.concatenate([self.common, others.common]),
         )
 
-    def with_others(self, which: NDArray[np.bool_] | NDArray[np.intp], others: CornerErrors) -> CornerErrors:
+    def with_others(
+        self, which: NDArray[np.bool_] | NDArray[np.intp], others: CornerErrors
+    ) -> CornerErrors:
         """Return a copy in which ``others`` replace the markers ``which`` (n,)."""
         white, common = self.whitening.copy(), self.common.copy()
         white[which], common[which] = others.whitening, others.common

@@ -100,7 +100,7 @@ def fit(
         c_int64(white.shape[1]), c_int64(n), address(margin), address(ends), address(white),
         address(corners), address(explained), address(covariance),
     )  # fmt: skip
-    stated = covariance + LEAST_SIGMA_PX**2 * np.eye(8)
-    own = np.linalg.inv(np.linalg.cholesky(stated))
+    roots = np.linalg.cholesky(covariance + LEAST_SIGMA_PX**2 * np.eye(8))
+    own = np.asarray(np.linalg.inv(roots), dtype=float)
     errors = CornerErrors(frames.whitening_of(own, corners), np.zeros((n, 8)))
     return Refined(frames.out_of(corners), explained > 0.0, errors)

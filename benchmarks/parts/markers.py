@@ -509,14 +509,14 @@ def corner_errors(count: int, first: int = 0) -> Figures:
                 rotations.rotate(view.q, table.corners) + view.position
             )
             rows = np.flatnonzero(np.isin(table.ids, perception.estimate(view.image).marker_ids))
-            refined = perception.refined(view.image, truth[rows], rows)
-            for k in np.flatnonzero(refined.good).tolist():
-                white = refined.errors.whitening[k]
-                off = (refined.corners_px[k] - truth[rows[k]]).ravel()
-                area_px = float(cv2.contourArea(truth[rows[k]].astype(np.float32)))
-                cell_px = (
-                    area_px / mean_side_px(truth[rows[k : k + 1]])[0] / perception.reader.cells
-                )
+            for row in rows.tolist():  # each alone: all small ones by their cells
+                refined = perception.refined(view.image, truth[[row]], np.array([row]))
+                if not refined.good[0]:
+                    continue
+                white = refined.errors.whitening[0]
+                off = (refined.corners_px[0] - truth[row]).ravel()
+                area_px = float(cv2.contourArea(truth[row].astype(np.float32)))
+                cell_px = area_px / mean_side_px(truth[[row]])[0] / perception.reader.cells
                 found.append((cell_px, off, white @ off, np.linalg.inv(white.T @ white)))
         for low_px, high_px in pairwise((1.0, 2.0, 3.0, 5.0, 10.0, 100.0)):
             part = [f for f in found if low_px <= f[0] < high_px]

@@ -123,7 +123,7 @@ static void fit_patterns(void) {
     const int64_t height = whole(2, 90), width = whole(2, 90), n = whole(0, 2), cells = whole(3, 18);
     const uint8_t *image = image_of(height, width), *white = bytes(n * cells * cells);
     double *camera = outputs(4), *margin = doubles(n, 0.0, 0.6), *corners = outputs(8 * n),
-           *covariance = outputs(64 * n), *explained = outputs(n),
+           *covariance = doubles(64 * n, -1.0, 1.0), *explained = outputs(n),
            *frames = doubles(9 * n, -0.02, 0.02);
     uint8_t *outlined = bytes(n), *framed = bytes(n);
     const int distorted = (int)whole(0, 1);
@@ -141,14 +141,16 @@ static void fit_patterns(void) {
                                      ? special()
                                      : (i % 2 ? y : x) + half * around[i] + uniform(-1.0, 1.0);
     }
-    double *given = copy_of(corners, 8 * n);
+    double *given = copy_of(corners, 8 * n), *before = copy_of(covariance, 64 * n);
     NAME(fit_patterns)(image, height, width, camera, distorted ? &lens : NULL, frames, framed, &set,
                        cells, n, margin, outlined, white, corners, explained, covariance);
     for (int64_t m = 0; m < n; m++) {
         CHECK(explained[m] >= 0.0 && explained[m] <= 1.0);
         if (explained[m] > 0.0)
             CHECK(all_finite(corners + 8 * m, 8) && all_finite(covariance + 64 * m, 64));
-        else CHECK(same_bits(corners + 8 * m, given + 8 * m, 8));
+        else
+            CHECK(same_bits(corners + 8 * m, given + 8 * m, 8) &&
+                  same_bits(covariance + 64 * m, before + 64 * m, 64));
     }
 }
 

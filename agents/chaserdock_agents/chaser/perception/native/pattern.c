@@ -14,6 +14,7 @@
 /* Terms of the series of a blurred corner; with five, 0.004 is left at a correlation of 0.8. */
 #define ORDERS 5
 #define PATTERN_UNKNOWNS (LEVELS + 1 + SHAPES + ENDS)
+#define PATTERN_NORMAL (PATTERN_UNKNOWNS * PATTERN_UNKNOWNS)
 
 /* Settings, in the order of the Python caller; see pattern.py for each. */
 typedef struct {
@@ -56,8 +57,8 @@ static Place place_of(const double *inverse, double x, double y) {
 
 /* How far beyond the sides pixels are used, as a share of the side, at a gradient by pixels. */
 static double used_share(const PatternSettings *set, double margin, int outlined, double gradient) {
-    return outlined ? margin
-                    : max_of(min_of(margin - set->clear_px * gradient, set->reach_px * gradient), 0.0);
+    double share = min_of(margin - set->clear_px * gradient, set->reach_px * gradient);
+    return outlined ? margin : max_of(share, 0.0);
 }
 
 static double steepness(const Place *p, int k) {
@@ -114,7 +115,8 @@ static int collect_patch(const Image *p, const PatternSettings *set, const doubl
 }
 
 /* What strips along one axis are, blurred by `sigma`, at a place: their share of the blur, and its
- * derivatives by it, as the terms of `add_product`. They begin at `first + i * width`, i < `count`. */
+ * derivatives by it, as the terms of `add_product`. They begin at `first + i * width`, i <
+ * `count`. */
 static void strips_at(const Edge *edge, double at, double sigma, double first, double width,
                       int count, double (*share)[ORDERS]) {
     double last[ORDERS] = {0.0}, next[ORDERS];
@@ -192,13 +194,14 @@ static void displacements(double x, double y, double (*by)[2]) {
         for (int k = 0; k < 2; k++) by[i][k] = one[i][k];
 }
 
-/* Fits the corners of a marker to its pixels: white - depth * black, and, if the border ends on
- * all sides (`outlined`), a level of its own beyond each end. Returns the share of the pixels' variance that is explained, 0 if
- * it cannot be fitted; `covariance` (8, 8) of the corners for independent pixels. */
+/* Fits the corners of a marker to its pixels: white - depth * black, and, if the border ends on all
+ * sides (`outlined`), a level of its own beyond each end. Returns the share of the pixels' variance
+ * that is explained, 0 if it cannot be fitted; `covariance` (8, 8) of the corners for independent
+ * pixels. */
 static double fit_patch(const PatternSettings *set, const Edge *edge, const Patch *patch,
                         double margin, int outlined, const uint8_t *white, int cells,
                         double *corners, double *covariance) {
-    double levels[PATTERN_UNKNOWNS] = {0.0}, log_sigma = set->log_sigma, normal[PATTERN_UNKNOWNS * PATTERN_UNKNOWNS];
+    double levels[PATTERN_UNKNOWNS] = {0.0}, log_sigma = set->log_sigma, normal[PATTERN_NORMAL];
     double prior = (2.0 / set->sigma_spread) * (2.0 / set->sigma_spread), explained = 0.0;
     double centre[2], half = 0.0, variance = 0.0;
     const int ends = outlined ? ENDS : 0, beyond_at = PATTERN_UNKNOWNS - ENDS, n = beyond_at + ends;
@@ -218,9 +221,8 @@ static double fit_patch(const PatternSettings *set, const Edge *edge, const Patc
     levels[1] = levels[0] - least;
     double total = square - sum * sum / patch->count;
     for (int step = 0; step < (int)set->iterations && settled == 0.0; step++) {
-        double inverse[9], a[PATTERN_UNKNOWNS * PATTERN_UNKNOWNS] = {0.0}, b[PATTERN_UNKNOWNS] = {0.0};
-        double right[PATTERN_UNKNOWNS];
-        double left = 0.0, sigma = exponential(log_sigma);
+        double inverse[9], a[PATTERN_NORMAL] = {0.0}, b[PATTERN_UNKNOWNS] = {0.0};
+        double right[PATTERN_UNKNOWNS], left = 0.0, sigma = exponential(log_sigma);
         to_square(corners, inverse);
         for (int i = 0; i < patch->count; i++) {
             double black[4], beyond[ENDS][4], row[PATTERN_UNKNOWNS], by[SHAPES][2], slope[2];
@@ -255,7 +257,8 @@ static double fit_patch(const PatternSettings *set, const Edge *edge, const Patc
         explained = total > 0.0 ? 1.0 - left / total : 0.0;
         variance = left / (patch->count - n);
         for (int k = 0; k < n; k++) levels[k] += k < LEVELS || k >= beyond_at ? b[k] : 0.0;
-        log_sigma = set->log_sigma + limited(log_sigma + limited(b[LEVELS], 0.2) - set->log_sigma, 1.0);
+        log_sigma += limited(b[LEVELS], 0.2);
+        log_sigma = set->log_sigma + limited(log_sigma - set->log_sigma, 1.0);
         double most = 1e-300;
         for (int k = 0; k < SHAPES; k++) most = max_of(most, abs_of(b[LEVELS + 1 + k]));
         double share = min_of(1.0 / most, 1.0);
@@ -267,7 +270,7 @@ static double fit_patch(const PatternSettings *set, const Edge *edge, const Patc
     if (settled == 0.0 || !(levels[1] >= set->min_contrast) || !all_finite(corners, 8)) return 0.0;
     double inverse[SHAPES][SHAPES];
     for (int k = 0; k < SHAPES; k++) {
-        double a[PATTERN_UNKNOWNS * PATTERN_UNKNOWNS], b[PATTERN_UNKNOWNS] = {0.0};
+        double a[PATTERN_NORMAL], b[PATTERN_UNKNOWNS] = {0.0};
         copy(normal, a, n * n);
         b[LEVELS + 1 + k] = 1.0;
         if (!solve_normal(a, b, n)) return 0.0;
@@ -275,11 +278,11 @@ static double fit_patch(const PatternSettings *set, const Edge *edge, const Patc
     }
     for (int i = 0; i < 8; i++)
         for (int j = 0; j < 8; j++) {
-            double total = 0.0;
+            sum = 0.0;
             for (int k = 0; k < SHAPES; k++)
                 for (int l = 0; l < SHAPES; l++)
-                    total += at_corner[i / 2][k][i & 1] * inverse[k][l] * at_corner[j / 2][l][j & 1];
-            covariance[8 * i + j] = variance * total;
+                    sum += at_corner[i / 2][k][i & 1] * inverse[k][l] * at_corner[j / 2][l][j & 1];
+            covariance[8 * i + j] = variance * sum;
         }
     for (int i = 0; i < 8; i++) /* as good as unknown */
         if (!(covariance[9 * i] < set->max_move_px * set->max_move_px)) return 0.0;
@@ -289,8 +292,8 @@ static double fit_patch(const PatternSettings *set, const Edge *edge, const Patc
 /* Fits the corners (n, 4, 2) of markers in place, in their frames as for `refine_corners`, to the
  * grey levels of their cells: `white` (n, cells, cells), 1 for white ones. `margin`, `outlined`: as
  * there. `explained` (n): share of the variance of the pixels that the pattern explains; 0, with
- * corners unchanged, for those that are not found. `covariance` (n, 8, 8): of found corners, px^2,
- * for independent pixels. */
+ * corners and covariance unchanged, for those that are not found. `covariance` (n, 8, 8): of found
+ * corners, px^2, for independent pixels. */
 EXPORT void NAME(fit_patterns)(const uint8_t *image, int64_t height, int64_t width,
                                const double *camera, const Lens *lens, const double *frames,
                                const uint8_t *framed, const PatternSettings *set, int64_t cells,
@@ -302,16 +305,16 @@ EXPORT void NAME(fit_patterns)(const uint8_t *image, int64_t height, int64_t wid
     Patch patch;
     tabulate(&edge);
     for (int64_t m = 0; m < n; m++) {
-        double *given = corners + 8 * m, fitted[8], found = 0.0;
+        double *given = corners + 8 * m, fitted[8], errors[64], found = 0.0;
         p.frame = framed[m] ? frames + 9 * m : NULL;
         copy(given, fitted, 8);
         if (cells <= CELLS_MOST && all_finite(fitted, 8) &&
             collect_patch(&p, set, fitted, margin[m], outlined[m], &patch))
             found = fit_patch(set, &edge, &patch, margin[m], outlined[m], white + m * cells * cells,
-                              (int)cells, fitted, covariance + 64 * m);
+                              (int)cells, fitted, errors);
         for (int i = 0; i < 8 && found > 0.0; i++)
             if (!(abs_of(fitted[i] - given[i]) < set->max_move_px)) found = 0.0;
         explained[m] = found >= set->least_explained ? found : 0.0;
-        if (explained[m] > 0.0) copy(fitted, given, 8);
+        if (explained[m] > 0.0) copy(fitted, given, 8), copy(errors, covariance + 64 * m, 64);
     }
 }

@@ -28,9 +28,10 @@ for less."""
 ENOUGH = 6
 """Markers in one image beyond which further ones hardly improve the pose: no further one is fitted
 so. More: time, 0.2 ms each."""
-LEAST_SIGMA_PX = 0.004
-"""Standard deviation, px, of each coordinate beyond what the residuals of pixels tell: the NEES of
-poses from markers with cells of 3 to 5 px."""
+LEAST_SIGMA = 0.0015
+"""Standard deviation of each coordinate beyond what the residuals of pixels tell, as a share of a
+cell: the NEES of poses from markers with cells of 3 to 5 px. Larger: far poses are better than
+they state; smaller: near ones are worse."""
 
 
 @LIBRARY.structure("PatternSettings")
@@ -100,7 +101,8 @@ def fit(
         c_int64(white.shape[1]), c_int64(n), address(margin), address(ends), address(white),
         address(corners), address(explained), address(covariance),
     )  # fmt: skip
-    roots = np.linalg.cholesky(covariance + LEAST_SIGMA_PX**2 * np.eye(8))
+    least_px = LEAST_SIGMA * mean_side_px(corners) / white.shape[1]
+    roots = np.linalg.cholesky(covariance + (least_px**2)[:, None, None] * np.eye(8))
     own = np.asarray(np.linalg.inv(roots), dtype=float)
     errors = CornerErrors(frames.whitening_of(own, corners), np.zeros((n, 8)))
     return Refined(frames.out_of(corners), explained > 0.0, errors)

@@ -30,8 +30,8 @@ LEAST_CORRELATION = 0.7
 """Correlation of a marker's cells with those of its id, above which it is there: uniform noise in
 36 cells exceeds it once in 100,000, and once in 1,200 if 81 places are tried."""
 FAINT_CORRELATION = 0.35
-"""The same of a marker that may be there: blur takes so much of cells of a pixel. The fit of all
-its cells tells (`pattern`)."""
+"""The same of a marker that may be there, beside others that are: blur takes so much of cells of a
+pixel. The fit of all its cells tells (`pattern`). Smaller: more fits; larger: fewer far markers."""
 
 
 @LIBRARY.structure("ReadLimits")
@@ -56,7 +56,7 @@ class ReadMarkers:
     ``corners_px`` (m, 4, 2): projected, ideal; of a marker that was looked for: where its cells
     correlate best. ``finest_px`` (m,): width of the finer of cell and
     border, NaN for a marker that does not face the camera. ``rows`` (k,): of those whose cells were
-    read. ``faint`` (j,): of those that may be there.
+    read. ``faint`` (j,): of further ones that may be there.
     """
 
     corners_px: Array
@@ -105,5 +105,5 @@ class CellReader:
             address(skip), c_int64(reach), address(px), address(finest), address(found),
         )  # fmt: skip
         rows = np.flatnonzero(found > LEAST_CORRELATION)
-        faint = np.flatnonzero((found > FAINT_CORRELATION) & (found <= LEAST_CORRELATION))
-        return ReadMarkers(px, finest, rows, faint)
+        faint = (found > FAINT_CORRELATION) & (found <= LEAST_CORRELATION)
+        return ReadMarkers(px, finest, rows, np.flatnonzero(faint & (len(rows) > 0)))

@@ -7,9 +7,11 @@
 #define PATTERN_PIXELS 4096
 /* Capacity: cells along a side; OpenCV's dictionaries have up to 10. */
 #define CELLS_MOST 16
-/* Unknowns: white, depth of black; blur; displacement; rise beyond each end of the border. */
+/* Unknowns: levels of white and of black below it; then the blur. */
 #define LEVELS 2
+/* Unknowns of the displacement: those of a homography. */
 #define SHAPES 8
+/* Unknowns of the ends of the border: the rise beyond each side. */
 #define ENDS 4
 /* Terms of the series of a blurred corner; with five, 0.004 is left at a correlation of 0.8. */
 #define ORDERS 5

@@ -326,7 +326,7 @@ def rendering(count: int) -> Figures:
     )
 
 
-def far(count: int) -> Figures:
+def far(count: int, first: int = 0) -> Figures:
     """Return figures of views of the servicer, in whose images its markers are hardly large enough;
     of two solutions the nearer.
     """
@@ -336,7 +336,7 @@ def far(count: int) -> Figures:
     camera = scenario.camera_model()
     zero, out = np.zeros(3), Figures()
     for metres in (5.0, 6.0, 6.5, 7.0, 7.5):
-        rng, found = np.random.default_rng([24, int(10 * metres)]), []
+        rng, found = np.random.default_rng([24 + first, int(10 * metres)]), []
         for k in range(count):
             q = rotations.exp(rng.normal(0.0, 0.15, 3))
             turn = rotations.exp(rng.normal(0.0, 0.01, 3))
@@ -447,7 +447,7 @@ def best_detector(dictionary: cv2.aruco.Dictionary) -> cv2.aruco.ArucoDetector:
     return cv2.aruco.ArucoDetector(dictionary, best)
 
 
-def small(count: int) -> Figures:
+def small(count: int, first: int = 0) -> Figures:
     """Return NEES (of two poses the nearer) and number of markers, beside those that OpenCV's
     detector finds at the right place with its defaults and with its best settings, in random views
     by range.
@@ -465,7 +465,7 @@ def small(count: int) -> Figures:
             "opencv_best": best_detector(dictionary),
         }
         theirs, fewer = dict.fromkeys(detectors, 0), dict.fromkeys(detectors, 0)
-        for view in views.random_views(count, near_m, far_m, 3):
+        for view in views.random_views(count, near_m, far_m, 3 + first):
             sighting = perception.estimate(view.image)
             used = len(sighting.marker_ids)
             ours, missed = ours + used, missed + (not sighting.solutions)
@@ -495,7 +495,7 @@ def small(count: int) -> Figures:
     return out
 
 
-def corner_errors(count: int) -> Figures:
+def corner_errors(count: int, first: int = 0) -> Figures:
     """Return errors of fitted corners beside the stated ones, by the narrowest cell of a marker:
     root mean square, per coordinate; mean and median square of whitened errors (1 and 0.45).
     """
@@ -504,19 +504,19 @@ def corner_errors(count: int) -> Figures:
         views = Views(target, 960, 540)
         perception, table = views.perception(), MarkerTable.of(views.model)
         found: list[tuple[float, Array, Array, Array]] = []
-        for view in views.random_views(count, 0.4, 4.5, 5):
+        for view in views.random_views(count, 0.4, 4.5, 5 + first):
             truth = views.camera.project_ideal(
                 rotations.rotate(view.q, table.corners) + view.position
             )
             rows = np.flatnonzero(np.isin(table.ids, perception.estimate(view.image).marker_ids))
-            refined = perception.refined(view.image, truth[rows], rows)
-            for k in np.flatnonzero(refined.good).tolist():
-                white = refined.errors.whitening[k]
-                off = (refined.corners_px[k] - truth[rows[k]]).ravel()
-                area_px = float(cv2.contourArea(truth[rows[k]].astype(np.float32)))
-                cell_px = (
-                    area_px / mean_side_px(truth[rows[k : k + 1]])[0] / perception.reader.cells
-                )
+            for row in rows.tolist():  # each alone: all small ones by their cells
+                refined = perception.refined(view.image, truth[[row]], np.array([row]))
+                if not refined.good[0]:
+                    continue
+                white = refined.errors.whitening[0]
+                off = (refined.corners_px[0] - truth[row]).ravel()
+                area_px = float(cv2.contourArea(truth[row].astype(np.float32)))
+                cell_px = area_px / mean_side_px(truth[[row]])[0] / perception.reader.cells
                 found.append((cell_px, off, white @ off, np.linalg.inv(white.T @ white)))
         for low_px, high_px in pairwise((1.0, 2.0, 3.0, 5.0, 10.0, 100.0)):
             part = [f for f in found if low_px <= f[0] < high_px]
@@ -568,7 +568,7 @@ def held(count: int) -> Figures:
     return out
 
 
-COUNTS: dict[str, tuple[Callable[[int], Figures], int, int]] = {
+COUNTS: dict[str, tuple[Callable[..., Figures], int, int]] = {
     "rendering": (rendering, 200, 20),
     "speed": (speed, 200, 30),
     "reach": (reach, 100, 4),
@@ -582,6 +582,8 @@ COUNTS: dict[str, tuple[Callable[[int], Figures], int, int]] = {
     "bearing": (bearing, 80, 8),
 }
 """Number of views of each part, and number with ``--quick``."""
+SEEDED = "far", "small", "corners"
+"""Parts of other views with ``--first``."""
 
 
 def measure(name: str, options: Options) -> Figures:
@@ -589,7 +591,8 @@ def measure(name: str, options: Options) -> Figures:
     if options.strip is not None:
         SETTINGS.partial_px = options.strip
     part, full, quick = COUNTS[name]
-    return part(quick if options.quick else full)
+    count = quick if options.quick else full
+    return part(count, options.first) if name in SEEDED else part(count)
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -607,5 +610,6 @@ GROUP = Group(
         f"markers-{name}": described(partial(measure, name), part.__doc__ or "")
         for name, (part, _, _) in COUNTS.items()
     },
+    uses=("first",),
     add_options=add_options,
 )

@@ -190,18 +190,29 @@ def test_neighbours_of_one_far_marker_are_found_and_those_of_a_false_id_are_not(
             assert np.linalg.norm(result.solutions[0].position_irf_m - position) < 0.1
 
 
-@pytest.mark.parametrize(("distance_m", "factor"), [(4.0, 1.0), (1.0, 0.6)])
-def test_small_residuals_do_not_reduce_the_covariance_of_small_markers(distance_m, factor):
-    camera, table = Camera.from_hfov(640, 480, HFOV), pnp.MarkerTable.of(target_model("servicer"))
-    q, position = rotations.multiply(rotations.exp([0.4, 0.3, 0.0]), FACING), [0.0, 0.0, distance_m]
-    rows = np.argsort(rotations.rotate(q, table.normals)[:, 2], kind="stable")[:4]
-    px = camera.project_ideal(rotations.rotate(q, table.corners[rows]) + position)
-    errors = CornerErrors.even(np.full(4, 0.1))
-    solutions, _ = pnp.solve(camera, table, rows, px, errors)
-    pose = pnp.PoseInCamera(np.array(position), rotations.to_matrix(q))
-    stated = pnp.pose_covariance(camera, table.corners[rows], px, errors, pose)
-    assert stated is not None
-    assert solutions[0].covariance == pytest.approx(factor * stated[0], rel=1e-3, abs=1e-12)
+def test_far_markers_have_the_accuracy_of_all_their_cells():
+    """Cells of 2.5 pixels: single sides are drawn to inner cells, by 3 degrees and a NEES of 9."""
+    scene, rng = Scene(target_model("servicer")), np.random.default_rng(24)
+    squares, angles_rad = [], []
+    for number in range(20):
+        q, z = rotations.exp(rng.normal(0.0, 0.15, 3)), rng.uniform(4.0, 4.3)
+        q, position = rotations.multiply(q, FACING), np.append(rng.normal(0.0, 0.2, 2), z)
+        solutions = scene.perception.estimate(scene.image(position, q, number)).solutions
+        squares.append(nees_of(solutions, position, q))
+        angles_rad.append(min(rotations.angle_between(s.q_irf_trf_wxyz, q) for s in solutions))
+    assert np.degrees(np.sqrt(np.mean(np.square(angles_rad)))) < 0.6
+    assert 3.0 < np.mean(squares) < 8.5
+
+
+def test_markers_with_cells_of_a_pixel_are_read_by_the_blur_that_they_have():
+    """The blur leaves a correlation of 0.5 with the cells of this one."""
+    scene = Scene(target_model("servicer"))
+    q = rotations.normalize([0.802, 0.0958, -0.4648, -0.3625])
+    position = np.array([0.17062531, 0.15614545, 2.62794457])
+    ids = scene.perception.estimate(
+        scene.image(position, q, light=(-0.057, 2.296, -0.178))
+    ).marker_ids
+    assert 17 in ids
 
 
 def test_the_place_of_a_marker_tells_how_far_its_corners_move_together():

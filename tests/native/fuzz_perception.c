@@ -118,6 +118,42 @@ static void read_markers(void) {
     }
 }
 
+static void fit_patterns(void) {
+    static const double around[8] = {-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0};
+    const int64_t height = whole(2, 90), width = whole(2, 90), n = whole(0, 2), cells = whole(3, 18);
+    const uint8_t *image = image_of(height, width), *white = bytes(n * cells * cells);
+    double *camera = outputs(4), *margin = doubles(n, 0.0, 0.6), *corners = outputs(8 * n),
+           *covariance = doubles(64 * n, -1.0, 1.0), *explained = outputs(n),
+           *frames = doubles(9 * n, -0.02, 0.02);
+    uint8_t *outlined = bytes(n), *framed = bytes(n);
+    const int distorted = (int)whole(0, 1);
+    Lens lens = any_lens();
+    PatternSettings set = {uniform(-1.0, 1.0), uniform(0.05, 0.5), uniform(0.0, 2.0),
+                           uniform(0.0, 4.0),  value(0.0, 1.0),    uniform(0.5, 8.0),
+                           value(0.0, 20.0),   uniform(0.0, 1.0),  (double)whole(0, 9)};
+    for (int i = 0; i < 2; i++) camera[i] = value(20.0, 60.0), camera[2 + i] = value(0.0, 40.0);
+    for (int64_t m = 0; m < n; m++) {
+        const double x = uniform(0.0, (double)width), y = uniform(0.0, (double)height),
+                     half = chance(0.9) ? uniform(0.2, 20.0) : uniform(20.0, 90.0);
+        framed[m] = (uint8_t)(distorted && chance(0.5)), frames[9 * m + 8] = value(0.5, 1.5);
+        for (int i = 0; i < 8; i++)
+            corners[8 * m + i] = chance(special_share)
+                                     ? special()
+                                     : (i % 2 ? y : x) + half * around[i] + uniform(-1.0, 1.0);
+    }
+    double *given = copy_of(corners, 8 * n), *before = copy_of(covariance, 64 * n);
+    NAME(fit_patterns)(image, height, width, camera, distorted ? &lens : NULL, frames, framed, &set,
+                       cells, n, margin, outlined, white, corners, explained, covariance);
+    for (int64_t m = 0; m < n; m++) {
+        CHECK(explained[m] >= 0.0 && explained[m] <= 1.0);
+        if (explained[m] > 0.0)
+            CHECK(all_finite(corners + 8 * m, 8) && all_finite(covariance + 64 * m, 64));
+        else
+            CHECK(same_bits(corners + 8 * m, given + 8 * m, 8) &&
+                  same_bits(covariance + 64 * m, before + 64 * m, 64));
+    }
+}
+
 static void refine_pose(void) {
     const int64_t n = whole(0, 3);
     double *lens = lens_of_camera(), *points = doubles(12 * n, -0.3, 0.3),
@@ -339,6 +375,7 @@ static void measure_pose(void) {
 static const Target TARGETS[] = {
     {"refine_corners", refine_corners},
     {"read_markers", read_markers},
+    {"fit_patterns", fit_patterns},
     {"refine_pose", refine_pose},
     {"squared_errors", squared_errors},
     {"marker_errors", marker_errors},

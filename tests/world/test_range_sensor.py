@@ -109,10 +109,12 @@ def test_chaser_measures_by_ranging_far_away_and_by_markers_nearby() -> None:
 
 
 def test_of_bearing_and_markers_the_more_accurate_position_is_used() -> None:
-    perception, used = make_perception(flight_scenario(scenario())), []
-    assert isinstance(perception, FarPerception)
-    for metres in (5.5, 2.0):
-        taken = image((-metres, 0.0, -0.05))
+    used: list[bool] = []
+    for range_noise_m in (1e-3, 0.02):  # that of markers is 4 mm there
+        ranging = {"range_noise_m": range_noise_m}
+        perception = make_perception(flight_scenario(scenario(ranging=ranging)))
+        assert isinstance(perception, FarPerception)
+        taken = image((-6.5, 0.0, -0.05), ranging=ranging)
         (markers, *_) = perception.estimate(decode_image(taken)).solutions
         sighting = look(perception, taken, None)
         sigma = [

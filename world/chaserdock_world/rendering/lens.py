@@ -122,7 +122,7 @@ class LensMap:
         if self._maps is None:
             return ideal
         image = np.asarray(
-            cv2.remap(ideal, *self._maps, cv2.INTER_LINEAR, borderValue=SPACE_LEVEL),
+            cv2.remap(ideal, *self._maps, cv2.INTER_CUBIC, borderValue=SPACE_LEVEL),
             dtype=np.uint8,
         )
         if self._samples == 1:

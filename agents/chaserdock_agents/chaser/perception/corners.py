@@ -140,7 +140,9 @@ class CornerErrors:
             np.concatenate([self.common, others.common]),
         )
 
-    def with_others(self, which: NDArray[np.bool_], others: CornerErrors) -> CornerErrors:
+    def with_others(
+        self, which: NDArray[np.bool_] | NDArray[np.intp], others: CornerErrors
+    ) -> CornerErrors:
         """Return a copy in which ``others`` replace the markers ``which`` (n,)."""
         white, common = self.whitening.copy(), self.common.copy()
         white[which], common[which] = others.whitening, others.common
@@ -163,11 +165,11 @@ class Refined:
     good: NDArray[np.bool_]
     errors: CornerErrors
 
-    def part(self, which: NDArray[np.bool_]) -> Refined:
+    def part(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Refined:
         """Return the markers selected by ``which`` (n,)."""
         return Refined(self.corners_px[which], self.good[which], self.errors.part(which))
 
-    def with_others(self, which: NDArray[np.bool_], others: Refined) -> Refined:
+    def with_others(self, which: NDArray[np.bool_] | NDArray[np.intp], others: Refined) -> Refined:
         """Return a copy in which ``others`` replace the markers ``which`` (n,)."""
         corners, good = self.corners_px.copy(), self.good.copy()
         corners[which], good[which] = others.corners_px, others.good

@@ -14,14 +14,12 @@ from chaserdock_protocol.pose_image import UnusableImage
 from numpy.typing import ArrayLike, NDArray
 
 from . import baseline as paper
-from . import corners, detect, pnp
+from . import corners, detect, pattern, pnp
 from .corners import CornerErrors
+from .pattern import ENOUGH
 from .pnp import FurtherMarkers, TargetPose
 from .reading import PLACE_CELLS, CellReader
 from .refine import PoseInCamera
-
-_ENOUGH = 6
-"""Markers in one image beyond which further ones hardly improve the pose."""
 
 Method = Literal["default", "paper", "paper_iterative"]
 
@@ -95,13 +93,19 @@ class _Further:
         new = ~np.isin(coarse, used)
         coarse, px, errors = coarse[new], px[new], errors.part(new)
         if len(rows):
-            refined = by.refined(self._image, read.corners_px[rows], rows)
+            refined = by.refined(self._image, read.corners_px[rows], rows, len(used))
             rows = rows[refined.good]
             left = ~np.isin(coarse, rows)  # a fitted marker replaces a coarse one
             fitted = refined.part(refined.good)
             coarse = np.concatenate([rows, coarse[left]])
             px = np.concatenate([fitted.corners_px, px[left]])
             errors = fitted.errors.followed_by(errors.part(left))
+        if len(read.faint):
+            fitted = by.patterns(self._image, read.corners_px[read.faint], read.faint)
+            new = fitted.good & ~np.isin(read.faint, coarse)
+            coarse = np.concatenate([coarse, read.faint[new]])
+            px = np.concatenate([px, fitted.corners_px[new]])
+            errors = errors.followed_by(fitted.errors.part(new))
         before, count = len(self._rows), len(coarse)
         if reach:
             at = read.corners_px[read.rows]
@@ -138,7 +142,7 @@ class Perception:
         self._dictionary = detect.dictionary_of(model.dictionary)
         self.table = pnp.MarkerTable.of(model)
         # Targets with many markers per face do not need the small ones that are lost at half size.
-        self._enough = _ENOUGH if len(model.markers) >= 6 * _ENOUGH else None
+        self._enough = ENOUGH if len(model.markers) >= 6 * ENOUGH else None
         self._rows = {int(i): row for row, i in enumerate(self.table.ids)}
         self.reader = CellReader(self.table, self._dictionary)
 
@@ -217,10 +221,28 @@ class Perception:
         return self._sighting(found.ids, solutions, self.table.ids[rows[used]], px[used])
 
     def refined(
+        self, image: NDArray[np.uint8], px: Array, rows: NDArray[np.intp], known: int = 0
+    ) -> corners.Refined:
+        """Return the corners of markers, refined by all cells of small ones, by the sides of
+        others; ``px`` (n, 4, 2), ideal: where they are to about two pixels.
+        """
+        margin, outlined = self.table.margin_share[rows], self.table.outlined[rows]
+        refined = corners.refine(image, self.camera, px, self.reader.cells, margin, outlined)
+        which = pattern.which_to_fit(self.camera, px, self.reader.cells, known)
+        for start in (refined.corners_px, px):  # by sides, and as they were found
+            if not len(which):
+                break
+            fitted = self.patterns(image, start[which], rows[which])
+            refined = refined.with_others(which, fitted)
+            which = which[~fitted.good]
+        return refined
+
+    def patterns(
         self, image: NDArray[np.uint8], px: Array, rows: NDArray[np.intp]
     ) -> corners.Refined:
-        margin, outlined = self.table.margin_share[rows], self.table.outlined[rows]
-        return corners.refine(image, self.camera, px, self.reader.cells, margin, outlined)
+        """Return the corners of small markers by all their cells; ``px`` as for `refined`."""
+        white, margin = self.reader.white[rows], self.table.margin_share[rows]
+        return pattern.fit(image, self.camera, px, white, margin, self.table.outlined[rows])
 
     def _estimate_paper(self, image: NDArray[np.uint8]) -> PerceptionResult:
         found = paper.detect(image, self.camera, self._dictionary)

@@ -22,7 +22,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel, clear_margin_m
 from numpy.typing import NDArray
 
-from .corners import CornerErrors, mean_side_px
+from .corners import CornerErrors
 from .refine import PoseInCamera, refine, residual_of, rotation_matrix
 from .views import count_visible_markers, marker_errors, squared_errors
 
@@ -35,9 +35,6 @@ _PRIOR_RESIDUALS = 4.0
 # Least factor of the stated variance by residuals: these do not show what all markers of an image
 # have in common. Larger: too large covariances; smaller: too small ones of many small markers.
 _LEAST_FACTOR = 0.6
-# The same if the largest marker has a shorter side, px, which is four pixels a cell: the lines of
-# such markers err alike, by pixels as wide as a quarter of a cell (docs/evidence/estimation.md).
-_SMALL_SIDE_PX, _LEAST_FACTOR_SMALL = 24.0, 1.0
 # Least cosine of the viewing angle of a single marker: at a more grazing angle its tilt is poorly
 # determined, with an optimistic covariance.
 MIN_SINGLE_COSINE = 0.25
@@ -566,9 +563,7 @@ def _solutions(seen: _DetectedMarkers, poses: list[PoseInCamera]) -> list[Target
         return []
     found.sort(key=lambda item: item[0])
     least, free = found[0][0], int(seen.errors.whitening.any(axis=2).sum()) - 6
-    small = float(mean_side_px(seen.pixels).max()) < _SMALL_SIDE_PX
-    floor = _LEAST_FACTOR_SMALL if small else _LEAST_FACTOR
-    factor = max((_PRIOR_RESIDUALS + least) / (_PRIOR_RESIDUALS + free), floor)
+    factor = max((_PRIOR_RESIDUALS + least) / (_PRIOR_RESIDUALS + free), _LEAST_FACTOR)
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     return [
         TargetPose(

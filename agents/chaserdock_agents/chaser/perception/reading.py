@@ -29,6 +29,9 @@ cell: twice what poses of rendered far markers show. Smaller: such places outwei
 LEAST_CORRELATION = 0.7
 """Correlation of a marker's cells with those of its id, above which it is there: uniform noise in
 36 cells exceeds it once in 100,000, and once in 1,200 if 81 places are tried."""
+FAINT_CORRELATION = 0.35
+"""The same of a marker that may be there, beside others that are: blur takes so much of cells of a
+pixel. The fit of all its cells tells (`pattern`). Smaller: more fits; larger: fewer far markers."""
 
 
 @LIBRARY.structure("ReadLimits")
@@ -41,9 +44,9 @@ class _ReadLimits(Structure):
     ]  # fmt: skip
 
 
-# OpenCV reads no marker at a smaller cosine or with cells of less than a pixel; the sides need a
+# OpenCV reads no marker at a smaller cosine or with narrower cells; the sides need a
 # pixel beyond them; four places within the middle of a cell are sampled; contrast as for sides.
-LIMITS = _ReadLimits(0.08, 1.0, 1.0, 0.2, 8.0)
+LIMITS = _ReadLimits(0.08, 0.7, 1.0, 0.2, 8.0)
 
 
 @dataclass(frozen=True)
@@ -53,12 +56,13 @@ class ReadMarkers:
     ``corners_px`` (m, 4, 2): projected, ideal; of a marker that was looked for: where its cells
     correlate best. ``finest_px`` (m,): width of the finer of cell and
     border, NaN for a marker that does not face the camera. ``rows`` (k,): of those whose cells were
-    read.
+    read. ``faint`` (j,): of further ones that may be there.
     """
 
     corners_px: Array
     finest_px: Array
     rows: NDArray[np.intp]
+    faint: NDArray[np.intp]
 
 
 class CellReader:
@@ -67,12 +71,12 @@ class CellReader:
     def __init__(self, table: MarkerTable, dictionary: cv2.aruco.Dictionary) -> None:
         self._table, self.cells = table, dictionary.markerSize + 2
         self._margin = np.array(table.margin_share, dtype=float, order="C")
-        self._white = np.zeros((len(table.ids), self.cells, self.cells), dtype=np.uint8)
+        self.white = np.zeros((len(table.ids), self.cells, self.cells), dtype=np.uint8)
         # Ids beyond the dictionary are never seen: they stay black, without contrast.
         for row in np.flatnonzero(table.ids < len(dictionary.bytesList)).tolist():
             code = dictionary.bytesList[table.ids[row] : table.ids[row] + 1]
             bits = cv2.aruco.Dictionary.getBitsFromByteList(code, dictionary.markerSize)
-            self._white[row, 1:-1, 1:-1] = bits
+            self.white[row, 1:-1, 1:-1] = bits
 
     def read(
         self,
@@ -97,7 +101,9 @@ class CellReader:
             c_void_p(image.ctypes.data), c_int64(image.shape[0]), c_int64(image.shape[1]),
             (c_double * 4)(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
             lens, byref(LIMITS), address(surface), address(position),
-            address(self._margin), c_int64(m), address(self._white), c_int64(self.cells),
+            address(self._margin), c_int64(m), address(self.white), c_int64(self.cells),
             address(skip), c_int64(reach), address(px), address(finest), address(found),
         )  # fmt: skip
-        return ReadMarkers(px, finest, np.flatnonzero(found > LEAST_CORRELATION))
+        rows = np.flatnonzero(found > LEAST_CORRELATION)
+        faint = (found > FAINT_CORRELATION) & (found <= LEAST_CORRELATION)
+        return ReadMarkers(px, finest, rows, np.flatnonzero(faint & (len(rows) > 0)))

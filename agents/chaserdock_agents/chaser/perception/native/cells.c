@@ -25,13 +25,8 @@ static double least_extent(const double *px) {
  * of `p`, ideal pixels. */
 static double correlation(const Image *p, const ReadLimits *limits, const double *px,
                           const uint8_t *white, int64_t cells) {
-    /* Homography of the unit square, as for `borders_of`. */
-    double dx1 = px[2] - px[4], dx2 = px[6] - px[4], sx = ((px[0] - px[2]) + px[4]) - px[6];
-    double dy1 = px[3] - px[5], dy2 = px[7] - px[5], sy = ((px[1] - px[3]) + px[5]) - px[7];
-    double det = dx1 * dy2 - dx2 * dy1, g = (sx * dy2 - dx2 * sy) / det,
-           h = (dx1 * sy - sx * dy1) / det;
-    double ax = (px[2] - px[0]) + g * px[2], bx = (px[6] - px[0]) + h * px[6],
-           ay = (px[3] - px[1]) + g * px[3], by = (px[7] - px[1]) + h * px[7];
+    double h[9];
+    square_homography(px, h);
     double sum[2] = {0.0}, square = 0.0, count[2] = {0.0};
     for (int64_t row = 0; row < cells; row++)
         for (int64_t column = 0; column < cells; column++) {
@@ -39,11 +34,10 @@ static double correlation(const Image *p, const ReadLimits *limits, const double
             for (int k = 0; k < 4; k++) {
                 double u = (column + 0.5 + (k & 1 ? 1.0 : -1.0) * limits->sampled) / cells,
                        v = (row + 0.5 + (k & 2 ? 1.0 : -1.0) * limits->sampled) / cells;
-                double scale = 1.0 / ((g * u + h * v) + 1.0);
-                double x = ((ax * u + bx * v) + px[0]) * scale,
-                       y = ((ay * u + by * v) + px[1]) * scale;
-                if (p->lens) distort(p, &x, &y);
-                level += level_at(p, x, y);
+                double at[2];
+                on_square(h, u, v, at);
+                if (p->lens) distort(p, at, at + 1);
+                level += level_at(p, at[0], at[1]);
             }
             level *= 0.25;
             int is_white = white[row * cells + column] != 0;

@@ -108,6 +108,18 @@ static void distort(const Image *p, double *x, double *y) {
     *y = seen[1] * l[1] + l[3];
 }
 
+/* Converts a pixel to coordinates of the marker in work. `shift`: by how much the lens moves points
+ * near it; each step leaves what that changes by over the distance, at most 0.3 of it. */
+static void undistort_near(const Image *p, const double *pixel, const double *shift, int steps,
+                           double *q) {
+    for (int j = 0; j < 2; j++) q[j] = pixel[j] - shift[j];
+    for (int i = 0; i < steps && p->lens; i++) {
+        double d[2] = {q[0], q[1]};
+        distort(p, d, d + 1);
+        for (int j = 0; j < 2; j++) q[j] += pixel[j] - d[j];
+    }
+}
+
 /* Samples a row across a side: position `along` it (-0.5 to 0.5), offsets `across` (taps), pixels,
  * positive outwards. Returns whether both ends of the row, and thus all of it, lie inside the
  * image. */
@@ -259,22 +271,34 @@ typedef struct {
     double at, rise;
 } Border;
 
-/* Borders of the four sides from the corners and the border's share of the marker's side. */
-static void borders_of(const double *c, const Side *sides, double share, Border *borders) {
-    /* Homography of the unit square (P. S. Heckbert, "Fundamentals of Texture Mapping and Image
-     * Warping", 1989). */
+/* Homography (3, 3) of the unit square to corners (P. S. Heckbert, "Fundamentals of Texture Mapping
+ * and Image Warping", 1989). */
+static void square_homography(const double *c, double *h) {
     double dx1 = c[2] - c[4], dx2 = c[6] - c[4], sx = ((c[0] - c[2]) + c[4]) - c[6];
     double dy1 = c[3] - c[5], dy2 = c[7] - c[5], sy = ((c[1] - c[3]) + c[5]) - c[7];
-    double det = dx1 * dy2 - dx2 * dy1, g = (sx * dy2 - dx2 * sy) / det,
-           h = (dx1 * sy - sx * dy1) / det;
-    double ax = (c[2] - c[0]) + g * c[2], bx = (c[6] - c[0]) + h * c[6],
-           ay = (c[3] - c[1]) + g * c[3], by = (c[7] - c[1]) + h * c[7], outer[8];
-    for (int i = 0; i < 4; i++) {
-        double u = i == 1 || i == 2 ? 1.0 + share : -share, v = i >= 2 ? 1.0 + share : -share;
-        double scale = 1.0 / ((g * u + h * v) + 1.0);
-        outer[2 * i] = ((ax * u + bx * v) + c[0]) * scale;
-        outer[2 * i + 1] = ((ay * u + by * v) + c[1]) * scale;
+    double det = dx1 * dy2 - dx2 * dy1;
+    h[6] = (sx * dy2 - dx2 * sy) / det, h[7] = (dx1 * sy - sx * dy1) / det, h[8] = 1.0;
+    for (int k = 0; k < 2; k++) {
+        h[3 * k] = (c[2 + k] - c[k]) + h[6] * c[2 + k];
+        h[3 * k + 1] = (c[6 + k] - c[k]) + h[7] * c[6 + k];
+        h[3 * k + 2] = c[k];
     }
+}
+
+/* Where a homography puts a point of the unit square. */
+static void on_square(const double *h, double u, double v, double *out) {
+    double scale = 1.0 / ((h[6] * u + h[7] * v) + h[8]);
+    for (int k = 0; k < 2; k++)
+        out[k] = ((h[3 * k] * u + h[3 * k + 1] * v) + h[3 * k + 2]) * scale;
+}
+
+/* Borders of the four sides from the corners and the border's share of the marker's side. */
+static void borders_of(const double *c, const Side *sides, double share, Border *borders) {
+    double h[9], outer[8];
+    square_homography(c, h);
+    for (int i = 0; i < 4; i++)
+        on_square(h, i == 1 || i == 2 ? 1.0 + share : -share, i >= 2 ? 1.0 + share : -share,
+                  outer + 2 * i);
     for (int i = 0; i < 4; i++) {
         const Side *s = sides + i;
         double along[2], across[2],
@@ -338,12 +362,7 @@ static void collect(const Image *p, const Settings *set, const Side *s, const Bo
              row += 1.0) {
             double pixel[2], q[2];
             pixel[k] = line, pixel[o] = row;
-            for (int j = 0; j < 2; j++) q[j] = pixel[j] - shift[j];
-            for (int i = 0; i < 2 && p->lens; i++) {
-                double d[2] = {q[0], q[1]};
-                distort(p, d, d + 1);
-                for (int j = 0; j < 2; j++) q[j] += pixel[j] - d[j];
-            }
+            undistort_near(p, pixel, shift, 2, q);
             double x = q[0] - s->start[0], y = q[1] - s->start[1];
             double offset = x * s->normal[0] + y * s->normal[1],
                    along = (x * s->vector[0] + y * s->vector[1]) / length;

@@ -4,6 +4,7 @@
 #include "elementary.h"
 #include "corners.c"
 #include "cells.c"
+#include "pattern.c"
 #include "pose.c"
 #include "views.c"
 #include "mesh.c"

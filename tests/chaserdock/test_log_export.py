@@ -82,7 +82,9 @@ def test_exported_files_hold_every_message_with_units(tmp_path: Path) -> None:
     rows = export(GOLDEN, tmp_path / "parquet", "parquet", images=True)
     assert rows["controller_target.parquet"] == 18
     # Lists of structures within a message have tables of their own.
-    nested = ("_solutions.parquet", "_relative.parquet", "_cameras.parquet", "_bodies.parquet")
+    nested = tuple(
+        f"_{name}.parquet" for name in ("solutions", "relative", "cameras", "bodies", "innovations")
+    )
     messages = sum(n for name, n in rows.items() if not name.endswith(nested))
     assert messages == sum(count_messages(GOLDEN).values())
     truth = pq.read_table(tmp_path / "parquet" / "truth_body.parquet")

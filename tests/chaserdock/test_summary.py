@@ -70,7 +70,7 @@ def test_documented_fields_equal_the_produced_fields() -> None:
 
 def test_innovations_show_the_mean_of_the_used_and_what_is_beyond_the_band() -> None:
     """The band ends at 14.45 for six degrees of freedom; nothing of it is judged."""
-    flight = load_flight(GOLDEN)
+    flight = replace(load_flight(GOLDEN), innovations={})
     history = InnovationHistory(
         time_s=np.array([0.1, 0.6, 0.7, 0.8, 0.9]),
         squared=np.array([90.0, 3.0, 15.0, 60.0, 14.4]),
@@ -100,7 +100,14 @@ def test_innovations_show_the_mean_of_the_used_and_what_is_beyond_the_band() -> 
 
 def test_innovations_of_a_log_are_collected_by_chaser(tmp_path: Path) -> None:
     """A log from before them states none."""
-    assert load_flight(GOLDEN).innovations == {}
+
+    def silent(record: Record) -> Message:
+        if not isinstance(record.message, TargetEstimate):
+            return record.message
+        return structs.replace(record.message, innovations=None)
+
+    early = rewritten(GOLDEN, tmp_path / "early.mcap", silent)
+    assert load_flight(early).innovations == {}
 
     def stated(record: Record) -> Message:
         if not isinstance(record.message, TargetEstimate):
@@ -120,7 +127,8 @@ def test_innovations_of_a_log_are_collected_by_chaser(tmp_path: Path) -> None:
 
 def test_innovations_are_drawn_and_listed_where_they_are_stated() -> None:
     """By chaser, rejected ones by themselves."""
-    flight, time_s = load_flight(GOLDEN), np.linspace(0.6, 1.1, 8)
+    flight = replace(load_flight(GOLDEN), innovations={})
+    time_s = np.linspace(0.6, 1.1, 8)
     history = InnovationHistory(time_s, np.full(8, 3.0), np.full(8, 6.0), time_s < 1.0)
     stated = replace(flight, innovations={0: history})
     drawn = innovations(stated, load_traces(GOLDEN, flight.scenario)).axes[0]

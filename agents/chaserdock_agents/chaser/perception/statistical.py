@@ -27,6 +27,7 @@ from .corners import SETTINGS
 from .detect import dictionary_of
 from .lens import strong_stretch
 from .native import LIBRARY, function
+from .pattern import SMALL_CELL_PX
 from .pipeline import PerceptionResult
 from .pnp import MIN_SINGLE_COSINE, MarkerTable, TargetPose
 
@@ -42,6 +43,9 @@ class _MarkerLimits(Structure):
             # its ends. Of both what small cells add, of 1 px, by the power -1.25 of their width.
             # Most lines of pixels that are fitted.
             "place_px", "slope_px", "fine_place_px", "fine_slope_px", "most_lines",
+            # The same two, without more for small cells, of markers that are fitted by all their
+            # cells, those with narrower ones than this, px (`pattern`).
+            "small_cell_px", "small_place_px", "small_slope_px",
             # Cells along a side; least width of one, px, and least cosine of the viewing angle of
             # a marker that is read where others put it.
             "cells", "least_cell_px", "least_cosine",
@@ -68,6 +72,7 @@ class StatisticalPerception:
         cells = dictionary_of(model.dictionary).markerSize + 2
         self._limits = _MarkerLimits(
             0.0625, 0.187, 0.6, 0.9, SETTINGS.columns,
+            SMALL_CELL_PX, 0.05, 0.1,
             cells, 1.2, 0.1, 14.0, 0.3, MIN_SINGLE_COSINE, 2.0,
         )  # fmt: skip
         self._lens = (c_double * 6)(

@@ -10,11 +10,12 @@ typedef struct {
 /* See the constants of statistical.py. */
 typedef struct {
     double place_px, slope_px, fine_place_px, fine_slope_px, most_lines;
+    double small_cell_px, small_place_px, small_slope_px;
     double cells, least_cell_px, least_cosine, least_side_px, least_cosine_found,
         least_cosine_single, margin_px;
 } MarkerLimits;
 LAYOUT(MarkerLimits, place_px, slope_px, fine_place_px, fine_slope_px, most_lines,
-       cells, least_cell_px, least_cosine, least_side_px, least_cosine_found, least_cosine_single,
+       small_cell_px, small_place_px, small_slope_px, cells, least_cell_px, least_cosine, least_side_px, least_cosine_found, least_cosine_single,
        margin_px)
 
 /* Factorize the symmetric a (6, 6) in place: lower triangle of G, G G' = a. Return 0 unless each
@@ -111,14 +112,19 @@ static void add_information(const PinholeCamera *lens, const MarkerLimits *limit
     double rows[4][2][6];
     for (int k = 0; k < 4; k++) corner_rows(lens, corners + 3 * k, position, rotation, rows[k]);
     double fine = 1.0 / (seen->cell * sqrt_of(sqrt_of(seen->cell)));
+    double fixed[2] = {limits->place_px, limits->slope_px};
+    double added[2] = {limits->fine_place_px * fine, limits->fine_slope_px * fine};
+    if (seen->cell < limits->small_cell_px) {
+        fixed[0] = limits->small_place_px, fixed[1] = limits->small_slope_px;
+        added[0] = added[1] = 0.0;
+    }
     for (int i = 0; i < 4; i++) {
         const Side *side = seen->sides + i;
         double longer = max_of(abs_of(side->vector[0]), abs_of(side->vector[1]));
         double lines = max_of(min_of(longer, limits->most_lines), 1.0);
-        double place = limits->fine_place_px * fine, slope = limits->fine_slope_px * fine;
-        double scale = stretch * stretch / lines;
-        double variance[2] = {scale * (limits->place_px * limits->place_px + place * place),
-                              scale * (limits->slope_px * limits->slope_px + slope * slope)};
+        double scale = stretch * stretch / lines, variance[2];
+        for (int e = 0; e < 2; e++)
+            variance[e] = scale * (fixed[e] * fixed[e] + added[e] * added[e]);
         double end[2][6], j[2][6];
         for (int e = 0; e < 2; e++)
             for (int a = 0; a < 6; a++)

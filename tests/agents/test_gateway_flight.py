@@ -43,7 +43,7 @@ def flown(
     monkeypatch: pytest.MonkeyPatch,
     seed: int = 1,
     faults: tuple[Any, ...] = (),
-    seconds: float = 40.0,
+    seconds: float = 34.0,
     cameras: bool = True,
     **others: Any,
 ) -> tuple[SimulatedFlight, Any]:
@@ -54,11 +54,8 @@ def flown(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_free_flyers_track_the_target(
-    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    flight, lab = flown(tmp_path, monkeypatch, seed)
+def test_free_flyers_track_the_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flight, lab = flown(tmp_path, monkeypatch)
     assert not flight.crashes
     assert set(flight.statuses.values()) == {0}
     for errors in tracking_errors_m(lab, 28.0).values():
@@ -166,7 +163,7 @@ def test_robots_may_be_armed_late_and_again(
         node.close()
         return arm_when_ready(options)
 
-    flight, lab = flown(tmp_path, monkeypatch, operator=arm_late)
+    flight, lab = flown(tmp_path, monkeypatch, seconds=40.0, operator=arm_late)
     assert not flight.crashes
     assert "disarmed: chaser" not in flight.output
     assert "contradicts the estimate" not in flight.output
@@ -201,17 +198,17 @@ def test_a_fault_stops_all_robots_with_a_named_reason(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind", ["camera frozen", "camera repeats", "frames lost", "camera clock steps"]
+    ("silent", "other"),
+    [("camera frozen", "frames lost"), ("camera repeats", "camera clock steps")],
 )
 def test_a_camera_that_fails_stops_nothing_that_is_safe(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    silent: str, other: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    faults = (Fault(kind, 10.0, 14.0),)
+    faults = (Fault(silent, 8.0, 12.0), Fault(other, 15.0, 19.0))
     flight, lab = flown(tmp_path, monkeypatch, faults=faults)
     assert not flight.crashes
     assert "disarmed" not in flight.output
-    silent = kind in ("camera frozen", "camera repeats")
-    assert flight.output.count("no new image: chaser 0") == silent
+    assert flight.output.count("no new image: chaser 0") == 1
     for errors in tracking_errors_m(lab, 30.0).values():
         assert np.sqrt(np.mean(errors**2)) < 3e-3
 

@@ -207,9 +207,9 @@ def test_a_free_flyer_is_identified(found: RobotIdentification) -> None:
 
 @pytest.mark.slow(1)
 def test_standard_deviations_are_those_of_the_errors() -> None:
-    """Over 12 seeds, two-sided: chi-square of all values together with their covariance."""
+    """Over 6 seeds, two-sided: chi-square of all values together with their covariance."""
     total = freedoms = 0.0
-    for seed in range(12):
+    for seed in range(6):
         found = identify_robot(free_flyer(seed, 200, SIGMAS))
         order = ["mass", *list(TRUE)[2:], "delay"]
         total += _chi_square(found, TRUE, order)
@@ -265,9 +265,9 @@ def _row_of(found: RobotIdentification, name: str) -> int:
 
 @pytest.mark.slow(1)
 def test_standard_deviations_are_honest_where_pulses_scatter() -> None:
-    """Over 4 seeds, two-sided, with a scatter of 10 % that dominates the noise of the rates."""
+    """Over 2 seeds, two-sided, with a scatter of 10 % that dominates the noise of the rates."""
     total = freedoms = 0.0
-    for seed in range(4):
+    for seed in range(2):
         robot, thrusts_N = thruster_robot(seed, 150, 0.1)
         found = identify_robot(robot, mass_kg=24.0)
         assert found.scatter_share == pytest.approx(0.1, abs=0.06)
@@ -304,10 +304,10 @@ def test_a_late_robot_is_late() -> None:
 
 @pytest.mark.slow(1)
 def test_lag_is_told_from_delay_with_honest_standard_deviations() -> None:
-    """Over 8 seeds, two-sided: 25 ms of lag after 55 ms of delay."""
+    """Over 4 seeds, two-sided: 25 ms of lag after 55 ms of delay."""
     total, freedoms, delay_s, lag_s = 0.0, 0, 0.055, 0.025
     true = TRUE | {"delay": delay_s + lag_s}
-    for seed in range(8):
+    for seed in range(4):
         wrenches = commanded_wrenches(seed, 200)
         motion = lagging_motion(wrenches, delay_s, lag_s, SIGMAS, seed)
         found = identify_robot(robot_under(wrenches, motion))

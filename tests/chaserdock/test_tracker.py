@@ -53,7 +53,7 @@ def test_views_of_a_sheet_at_one_metre() -> None:
     200 views.
     """
     lens = Lens()
-    errors, squares, lost = errors_of(lens, 60, Photograph(lens))
+    errors, squares, lost = errors_of(lens, 30, Photograph(lens))
     away, turned = (np.linalg.norm(e, axis=1) for e in (errors[:, :3], errors[:, 3:]))
     assert lost == 0
     assert away.max() < 1e-3

@@ -7,6 +7,7 @@ import errno
 import os
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,7 @@ def test_documented_fields_equal_the_produced_fields() -> None:
 
 def test_innovations_show_the_mean_of_the_used_and_what_is_beyond_the_band() -> None:
     """The band ends at 14.45 for six degrees of freedom; nothing of it is judged."""
-    flight = replace(load_flight(GOLDEN), innovations={})
+    flight = load_flight(GOLDEN)
     history = InnovationHistory(
         time_s=np.array([0.1, 0.6, 0.7, 0.8, 0.9]),
         squared=np.array([90.0, 3.0, 15.0, 60.0, 14.4]),
@@ -101,24 +102,23 @@ def test_innovations_show_the_mean_of_the_used_and_what_is_beyond_the_band() -> 
 def test_innovations_of_a_log_are_collected_by_chaser(tmp_path: Path) -> None:
     """A log from before them states none."""
 
-    def silent(record: Record) -> Message:
-        if not isinstance(record.message, TargetEstimate):
-            return record.message
-        return structs.replace(record.message, innovations=None)
+    def stating(innovations: Callable[[TargetEstimate], Any], name: str) -> Path:
+        def changed(record: Record) -> Message:
+            estimate = record.message
+            if not isinstance(estimate, TargetEstimate):
+                return estimate
+            return structs.replace(estimate, innovations=innovations(estimate))
 
-    early = rewritten(GOLDEN, tmp_path / "early.mcap", silent)
-    assert load_flight(early).innovations == {}
+        return rewritten(GOLDEN, tmp_path / name, changed)
 
-    def stated(record: Record) -> Message:
-        if not isinstance(record.message, TargetEstimate):
-            return record.message
+    def two(estimate: TargetEstimate) -> tuple[Innovation, ...]:
         one = Innovation(
-            chaser=1, sim_time_ns=record.message.sim_time_ns, squared=4.5, freedoms=6, used=True
+            chaser=1, sim_time_ns=estimate.sim_time_ns, squared=4.5, freedoms=6, used=True
         )
-        other = structs.replace(one, squared=99.0, used=False)
-        return structs.replace(record.message, innovations=(one, other))
+        return one, structs.replace(one, squared=99.0, used=False)
 
-    log = rewritten(GOLDEN, tmp_path / "mission.mcap", stated)
+    assert load_flight(stating(lambda _: None, "early.mcap")).innovations == {}
+    log = stating(two, "mission.mcap")
     (found,) = load_flight(log).innovations.values()
     assert found.squared.tolist() == [4.5, 99.0] * (len(found.used) // 2)
     assert found.used.tolist() == [True, False] * (len(found.used) // 2)

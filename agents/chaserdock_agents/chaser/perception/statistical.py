@@ -2,9 +2,10 @@
 """Draw the measured pose around the true one, with the errors that rendered images have.
 
 Markers count as seen if they are large enough, face the camera and lie in the image. The errors of
-the lines of their sides, as `corners` states them in rendered images, give the covariance of the
-pose, as in ``pnp``, and the error is drawn from it. ``tests/missions/test_statistical.py`` compares
-both with rendered images. Where no marker is seen, ``[ranging]`` gives bearing, range and attitude.
+the lines of their sides, as `corners` states them in rendered images, for small markers `pattern`,
+give the covariance of the pose, as in ``pnp``, and the error is drawn from it.
+``tests/missions/test_statistical.py`` compares both with rendered images. Where no marker is seen,
+``[ranging]`` gives bearing, range and attitude.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ class _MarkerLimits(Structure):
             # its ends. Of both what small cells add, of 1 px, by the power -1.25 of their width.
             # Most lines of pixels that are fitted.
             "place_px", "slope_px", "fine_place_px", "fine_slope_px", "most_lines",
-            # The same two, without more for small cells, of markers that are fitted by all their
-            # cells, those with narrower ones than this, px (`pattern`).
+            # Width of a cell, px, below which a marker is fitted by all its cells (`pattern`), and
+            # the two standard deviations of such a marker, to which nothing is added.
             "small_cell_px", "small_place_px", "small_slope_px",
             # Cells along a side; least width of one, px, and least cosine of the viewing angle of
             # a marker that is read where others put it.

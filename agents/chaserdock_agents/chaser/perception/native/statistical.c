@@ -15,8 +15,8 @@ typedef struct {
         least_cosine_single, margin_px;
 } MarkerLimits;
 LAYOUT(MarkerLimits, place_px, slope_px, fine_place_px, fine_slope_px, most_lines,
-       small_cell_px, small_place_px, small_slope_px, cells, least_cell_px, least_cosine, least_side_px, least_cosine_found, least_cosine_single,
-       margin_px)
+       small_cell_px, small_place_px, small_slope_px, cells, least_cell_px, least_cosine,
+       least_side_px, least_cosine_found, least_cosine_single, margin_px)
 
 /* Factorize the symmetric a (6, 6) in place: lower triangle of G, G G' = a. Return 0 unless each
  * pivot is larger than ``least`` (false for NaN). */
@@ -112,19 +112,19 @@ static void add_information(const PinholeCamera *lens, const MarkerLimits *limit
     double rows[4][2][6];
     for (int k = 0; k < 4; k++) corner_rows(lens, corners + 3 * k, position, rotation, rows[k]);
     double fine = 1.0 / (seen->cell * sqrt_of(sqrt_of(seen->cell)));
-    double fixed[2] = {limits->place_px, limits->slope_px};
-    double added[2] = {limits->fine_place_px * fine, limits->fine_slope_px * fine};
+    double place = limits->fine_place_px * fine, slope = limits->fine_slope_px * fine;
+    double square[2] = {limits->place_px * limits->place_px + place * place,
+                        limits->slope_px * limits->slope_px + slope * slope};
     if (seen->cell < limits->small_cell_px) {
-        fixed[0] = limits->small_place_px, fixed[1] = limits->small_slope_px;
-        added[0] = added[1] = 0.0;
+        square[0] = limits->small_place_px * limits->small_place_px;
+        square[1] = limits->small_slope_px * limits->small_slope_px;
     }
     for (int i = 0; i < 4; i++) {
         const Side *side = seen->sides + i;
         double longer = max_of(abs_of(side->vector[0]), abs_of(side->vector[1]));
         double lines = max_of(min_of(longer, limits->most_lines), 1.0);
-        double scale = stretch * stretch / lines, variance[2];
-        for (int e = 0; e < 2; e++)
-            variance[e] = scale * (fixed[e] * fixed[e] + added[e] * added[e]);
+        double scale = stretch * stretch / lines;
+        double variance[2] = {scale * square[0], scale * square[1]};
         double end[2][6], j[2][6];
         for (int e = 0; e < 2; e++)
             for (int a = 0; a < 6; a++)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,8 +25,6 @@ Longer: the attitude within the gap is less certain; shorter: more dropouts spli
 """
 _LEAST_S = 10.0
 """Shortest free motion, s, that is identified. Shorter: hardly more than one manoeuvre."""
-_KEPT_NS = 2_000_000_000
-"""Time, ns, for which pulses are kept: more than a gap and the largest delay together."""
 _STARTS, _STOPS = ("arm accepted",), ("disarm accepted", "kill accepted", "disarmed")
 """Events of a gateway from which its robots act, and no longer act."""
 
@@ -63,10 +60,14 @@ class Pulses:
 
     def __init__(self, scenario: Scenario, commands: Sequence[ActuatorCommand]) -> None:
         self._thrusters = scenario.chaser.thrusters
+        self._valves = Valves(self._thrusters)
         self._pulses = sorted(
             (p.open_ns, p.close_ns, p.thruster) for c in commands for p in c.pulses
         )
-        self._shut = [(c.effective_time_ns, c.isolated) for c in commands]
+        for open_ns, close_ns, thruster in self._pulses:
+            self._valves.pulse(thruster, open_ns, close_ns)
+        for command in commands:
+            self._valves.set_shut(command.isolated, command.effective_time_ns)
 
     @property
     def acted(self) -> bool:
@@ -78,26 +79,9 @@ class Pulses:
         each (latencies, K - 1, n), if they come later by each of the delays. The lag of valves is
         part of their model.
         """
-        delays_s = [latency.delay_s for latency in latencies]
-        shape = (len(delays_s), len(time_ns) - 1, len(self._thrusters))
-        impulses, moments = np.zeros(shape), np.zeros(shape)
-        late_ns = [round(d * 1e9) for d in delays_s]
-        valves, pulses, shut = Valves(self._thrusters), iter(self._pulses), iter(self._shut)
-        coming, closing = next(pulses, None), next(shut, None)
-        for k, (begin_ns, end_ns) in enumerate(pairwise(time_ns.tolist())):
-            while coming is not None and coming[0] <= end_ns - min(late_ns):
-                valves.pulse(coming[2], coming[0], coming[1])
-                coming = next(pulses, None)
-            while closing is not None and closing[0] <= end_ns - min(late_ns):
-                valves.set_shut(closing[1], closing[0])
-                closing = next(shut, None)
-            for row, late in enumerate(late_ns):
-                a, b = begin_ns - late, end_ns - late
-                impulses[row, k] = valves.impulses(np.array([a, b]))[0]
-                moments[row, k] = valves.first_moments(a, b)
-            if k % 32 == 0:
-                valves.forget_before(begin_ns - max(late_ns) - _KEPT_NS)
-        return impulses, moments
+        late_ns = [round(latency.delay_s * 1e9) for latency in latencies]
+        found = [self._valves.impulses_and_moments(time_ns - late) for late in late_ns]
+        return np.array([x for x, _ in found]), np.array([x for _, x in found])
 
     lags = False
     """Whether a lag beside the stated one of the valves is told."""

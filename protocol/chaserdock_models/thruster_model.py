@@ -17,7 +17,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from .arrays import Array
+from .arrays import Array, IntArray
 
 FailureKind = Literal["stuck_off", "stuck_on", "weak"]
 """Failure modes of a thruster: never opens, never closes, or delivers a fraction of its thrust."""
@@ -205,18 +205,34 @@ class Valves:
         thruster, begin, end, rise, fall, factor = self._spans()
         out = np.zeros(len(self._thrusters))
         if len(thruster):
-            half_ns = (to_ns - from_ns) / 2.0
-
-            def moment_of(edge_ns: Array, length_ns: Array) -> Array:
-                # The integral of the impulse J(t) since ``from_ns``, less J(to) T / 2.
-                since, until = from_ns - edge_ns, to_ns - edge_ns
-                area = _ramp_integral(until, length_ns) - _ramp_integral(since, length_ns)
-                return area - half_ns * (_ramp(since, length_ns) + _ramp(until, length_ns))
-
-            moment = moment_of(begin, rise) - moment_of(end, fall)
+            moment = _moments(begin, rise, from_ns, to_ns) - _moments(end, fall, from_ns, to_ns)
             number = thruster.astype(int)
             np.add.at(out, number, factor * moment * (1e-18 * self._thrust_N[number]))
         return out
+
+    def impulses_and_moments(self, edges_ns: Array | IntArray) -> tuple[Array, Array]:
+        """Return impulses and first moments (see ``first_moments``), each (K, n), between
+        successive times (K + 1,), integer nanoseconds, in time proportional to K and to the number
+        of openings.
+        """
+        impulses, moments = np.zeros((2, len(edges_ns) - 1, len(self._thrusters)))
+        t = np.asarray(edges_ns, dtype=float)
+        spans = self._spans()
+        _, begin, end, rise, fall, _ = spans
+        # Pairs of an opening and an interval in which it gives thrust.
+        first = np.maximum(np.searchsorted(t, begin, side="right") - 1, 0)
+        last = np.minimum(np.searchsorted(t, np.maximum(begin + rise, end + fall)), len(impulses))
+        count = np.maximum(last - first, 0)
+        row = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
+        thruster, begin, end, rise, fall, factor = (np.repeat(x, count) for x in spans)
+        a, b = t[row], t[row + 1]
+        given = [_ramp(x - begin, rise) - _ramp(x - end, fall) for x in (a, b)]
+        moment = _moments(begin, rise, a, b) - _moments(end, fall, a, b)
+        number = thruster.astype(int)
+        full_N = factor * self._thrust_N[number]
+        np.add.at(impulses, (row, number), full_N * 1e-9 * (given[1] - given[0]))
+        np.add.at(moments, (row, number), full_N * 1e-18 * moment)
+        return impulses, moments
 
     def open_s(self, from_ns: int, to_ns: int) -> Array:
         """Return how long each thruster's valve is open between two times, (n,) s."""
@@ -250,3 +266,12 @@ def _ramp_integral(after_ns: Array, length_ns: Array) -> Array:
     length = np.maximum(length_ns, 1e-3)
     late = x * (x - length_ns) / 2.0 + length_ns * length_ns / 6.0
     return np.where(x < length, x * x * x / (6.0 * length), late)
+
+
+def _moments(edge_ns: Array, length_ns: Array, from_ns: Array | int, to_ns: Array | int) -> Array:
+    """Return the first moment, nanoseconds², about the middle of an interval of a linear rise from
+    0 to 1 at ``edge_ns``: the integral of its impulse J(t) since ``from_ns``, less J(to) T / 2.
+    """
+    since, until = from_ns - edge_ns, to_ns - edge_ns
+    area = _ramp_integral(until, length_ns) - _ramp_integral(since, length_ns)
+    return area - (to_ns - from_ns) / 2.0 * (_ramp(since, length_ns) + _ramp(until, length_ns))

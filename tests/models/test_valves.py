@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from chaserdock_models.arrays import Array
@@ -52,6 +54,30 @@ def test_first_moment_is_the_integral_of_thrust_by_time_to_the_middle(
     found = valves.first_moments(round(from_ms * MS), round(to_ms * MS))
     assert np.abs(expected).min() > 1e-5
     np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 1), st.integers(0, 900), st.integers(2, 200)), max_size=8),
+    st.lists(st.integers(1, 1999), min_size=2, max_size=12, unique=True),
+    st.one_of(st.none(), st.integers(0, 1500)),
+)
+@quick
+def test_impulses_and_moments_of_many_intervals_are_those_of_each(
+    pulses: list[tuple[int, int, int]], edges: list[int], shut_ms: int | None
+) -> None:
+    valves = Valves([thruster(4.0, 8.0), thruster(6.0, 0.0, 5.0)])
+    for number, begin, width in pulses:
+        valves.pulse(number, begin * MS, (begin + width) * MS)
+    if shut_ms is not None:
+        valves.set_shut((1,), shut_ms * MS)
+        valves.fail(0, "stuck_on", (shut_ms + 100) * MS)
+    times = [t * MS for t in sorted(edges)]
+    impulses, moments = valves.impulses_and_moments(np.array(times))
+    for k, (begin_ns, end_ns) in enumerate(pairwise(times)):
+        each = valves.impulses(np.array([begin_ns, end_ns]))[0]
+        np.testing.assert_allclose(impulses[k], each, rtol=1e-9, atol=1e-12)
+        each = valves.first_moments(begin_ns, end_ns)
+        np.testing.assert_allclose(moments[k], each, rtol=1e-9, atol=1e-12)
 
 
 def test_thrust_rises_and_falls_linearly() -> None:

@@ -238,17 +238,16 @@ class Laboratory:
             output = self.actuators[i].step(self.now_ns)
             if self.has("robot does not obey", i) and body.is_on:
                 output = np.array([2.5, 1.0, -0.5, 0.0, 0.0, 0.004])
-            force, torque = body.rotation.apply(output[:3]), output[3:]
+            force, torque = body.axes @ output[:3], output[3:]
             touch, twist = self.probes[i].load(body, self.target) if i in self.probes else NOTHING
             if touch.any():
                 tip, _ = body.at(self.probes[i].tip)
-                inverse = body.rotation.inv()
                 force = force + touch
-                torque = torque + inverse.apply(twist + cross(tip - body.position, touch))
+                torque = torque + body.axes.T @ (twist + cross(tip - body.position, touch))
                 target_force -= touch
                 target_torque -= twist + cross(tip - self.target.position, touch)
             body.move(force, torque)
-        self.target.move(target_force, self.target.rotation.inv().apply(target_torque))
+        self.target.move(target_force, self.target.axes.T @ target_torque)
 
     def _note(self) -> None:
         bodies = {"target": self.target, **{f"chaser/{i}": b for i, b in self.chasers.items()}}

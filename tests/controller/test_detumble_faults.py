@@ -161,8 +161,7 @@ def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [6, 16])
-@pytest.mark.parametrize("plan_s", [None, 13.5])
+@pytest.mark.parametrize(("count", "plan_s"), [(16, None), (6, 13.5)])
 def test_a_stack_of_many_chasers_is_stopped(count: int, plan_s: float | None) -> None:
     """Up to four at each of four faces, side by side. Their thrusters stop it within a few seconds,
     or at less cost by a plan.

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Latch
@@ -97,8 +96,7 @@ class Laboratory:
             state = feed.track.newest_state()
             speed = rate = 0.0
             if state is not None:
-                speed = float(np.linalg.norm(state.velocity_m_s))
-                rate = float(np.linalg.norm(state.omega_rad_s))
+                speed, rate = math.hypot(*state.velocity_m_s), math.hypot(*state.omega_rad_s)
                 self.obedience[chaser].observe(newest_ns, state.velocity_m_s)
             jumped_m, feed.track.jumped_m = feed.track.jumped_m, 0.0
             if jumped_m > 0.0:

@@ -8,8 +8,9 @@ poses (least squares), or the device's own where it states them.
 
 from __future__ import annotations
 
-from collections import deque
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 from chaserdock_models import rotations
@@ -58,6 +59,9 @@ class MotionBounds:
     rate_sigma_rad_s: float
 
 
+_time_ns = attrgetter("time_ns")
+
+
 class BodyTrack:
     """Newest poses of one body. ``rejected``: poses that no motion explains, since the start.
     ``jumped_m``: how far the body's poses have jumped for good, until it is set to 0.
@@ -65,7 +69,7 @@ class BodyTrack:
 
     def __init__(self, bounds: MotionBounds) -> None:
         self._bounds = bounds
-        self._poses: deque[MeasuredPose] = deque(maxlen=_MOST_POSES)
+        self._poses: list[MeasuredPose] = []  # oldest first
         self._jumped: list[MeasuredPose] = []
         self._newest_state: FittedState | None = None
         self.rejected = 0
@@ -94,7 +98,8 @@ class BodyTrack:
         what is kept, or a jump; poses that have jumped replace the others once they agree.
         """
         poses = self._poses
-        if any(pose.time_ns == known.time_ns for known in poses):
+        place = bisect_left(poses, pose.time_ns, key=_time_ns)
+        if place < len(poses) and poses[place].time_ns == pose.time_ns:
             return False
         if poses and not self._is_reachable(poses[-1], pose):
             self.rejected += 1
@@ -104,21 +109,14 @@ class BodyTrack:
             if len(self._jumped) < _LEAST_JUMPS:
                 return False
             self.jumped_m = float(np.linalg.norm(pose.position_m - poses[-1].position_m))
-            poses.clear()
-            poses.extend(self._jumped)
+            poses[:] = sorted(self._jumped, key=_time_ns)
             self._newest_state = None
             self._jumped.clear()
             return True
         self._jumped.clear()
         self._newest_state = None
-        if poses and pose.time_ns < poses[-1].time_ns:
-            later = [poses.pop()]
-            while poses and poses[-1].time_ns > pose.time_ns:
-                later.append(poses.pop())
-            poses.extend((pose, *reversed(later)))
-        else:
-            poses.append(pose)
-        return True
+        poses.insert(place, pose)
+        return len(poses) <= _MOST_POSES or poses.pop(0) is not pose
 
     def _is_reachable(self, known: MeasuredPose, pose: MeasuredPose) -> bool:
         apart_m = float(np.linalg.norm(pose.position_m - known.position_m))
@@ -129,14 +127,15 @@ class BodyTrack:
         """Return the state at ``time_ns`` from the poses after ``since_ns``, None if there are
         none, or too few for a velocity.
         """
-        fresh = [p for p in self._poses if since_ns < p.time_ns <= time_ns]
+        first, after = (bisect_right(self._poses, t, key=_time_ns) for t in (since_ns, time_ns))
+        fresh = self._poses[first:after]
         if not fresh:
             return None
         if all(p.velocity_m_s is not None and p.omega_rad_s is not None for p in fresh):
             return self._by_velocities(fresh, time_ns)
-        older = [p for p in self._poses if p.time_ns <= since_ns]
-        while older and not _is_line(fresh):
-            fresh.insert(0, older.pop())
+        while first and not _is_line(fresh):
+            first -= 1
+            fresh.insert(0, self._poses[first])
         return _by_line(fresh, time_ns) if _is_line(fresh) else None
 
     def _by_velocities(self, poses: list[MeasuredPose], time_ns: int) -> FittedState:

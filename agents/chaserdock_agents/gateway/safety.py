@@ -45,8 +45,9 @@ def violations(robot: RobotSight, limits: LabSafety) -> list[str]:
         age = f"{robot.odometry_age_s:.2f} s old" if math.isfinite(robot.odometry_age_s) else "none"
         found.append(f"{name}: odometry lost ({age}, limit {limits.stale_s:g} s)")
         return found
-    lower, upper = np.array(limits.volume.lower_m), np.array(limits.volume.upper_m)
-    if not ((robot.position_m >= lower) & (robot.position_m <= upper)).all():
+    volume = limits.volume
+    places = zip(volume.lower_m, robot.position_m.tolist(), volume.upper_m, strict=True)
+    if not all(lower <= x <= upper for lower, x, upper in places):
         place = ", ".join(f"{x:.3f}" for x in robot.position_m)
         found.append(f"{name}: left the volume, at ({place}) m")
     if not robot.speed_m_s <= limits.max_speed_m_s:

@@ -138,9 +138,12 @@ def test_pictures_of_the_viewer_are_made_of_today_s_page(tmp_path: Path) -> None
 # -- a running mission -----------------------------------------------------------------------------
 
 
-def start_flight(hand: ByHand, out: Path, mode: str, *overrides: str) -> None:
-    """Start every process except the controller, which starts the flight."""
-    hand.start("world", "world", "two-chaser-tracking", "--mode", mode, *sets(*overrides))
+def start_flight(hand: ByHand, out: Path, mode: str, *overrides: str, nice: int = 0) -> None:
+    """Start every process except the controller, which starts the flight. ``nice``: of the world,
+    which all others wait for in lockstep, so that a browser without a GPU keeps up.
+    """
+    flown = ("two-chaser-tracking", "--mode", mode, *sets(*overrides))
+    hand.start("world", "world", *flown, preexec_fn=lambda: os.nice(nice))
     hand.start("recorder", "record", "--out", str(out))
     for i in (0, 1):
         hand.start(f"chaser/{i}", "chaser", str(i))
@@ -221,7 +224,7 @@ def test_scene_moves_and_click_starts_docking(hand: ByHand, tmp_path: Path, scri
     with viewer("-e", hand.endpoint, "--namespace", "seen") as url, chromium() as browser:
         page = open_page(browser, url, script=script)
         wait_for(page, "no mission is running")
-        start_flight(hand, tmp_path, "lockstep", *SHORT, "duration_s=3600.0")
+        start_flight(hand, tmp_path, "lockstep", *SHORT, "duration_s=3600.0", nice=19)
         hand.start("controller", "controller")
         wait_for(page, "target: tracking")
         page.get_by_role("button", name="approach").first.wait_for()

@@ -36,7 +36,6 @@ SEEDS: tuple[tuple[str, dict[str, Any], tuple[int, ...]], ...] = (
     ("fault-drill", {}, (12,)),
     ("four-chaser-docking", EARLY_DOCKING, (1,)),
     ("docking-contact", {}, (1,)),
-    ("swap", {}, (1,)),
 )
 """Scenarios, what is changed of them, and the seeds by which ``simulate`` disturbs them."""
 

@@ -242,7 +242,7 @@ def surfaces(body: DressedBody) -> Surfaces:
     """Return the surfaces of a body, in its axes."""
     out = {}
     for coat in dict.fromkeys(c for _, c in body.parts):
-        mesh = TriangleMesh("coat", tuple(p for p, c in body.parts if c is coat), {})
+        mesh = TriangleMesh("coat", tuple(p for p, c in body.parts if c == coat), {})
         soup = triangle_soup(mesh)
         corners, normals = soup.corners_m.reshape(-1, 3), soup.normals.reshape(-1, 3)
         # Seen along the axis that the triangle faces most.

@@ -53,14 +53,12 @@ class PathTracedCamera:
     def __init__(self, scenario: Scenario, camera: Camera, tracer: PathTracer) -> None:
         self._tracer = tracer
         disc = earth_disc(scenario)
-        self._to_earth_w = None if disc is None else np.array(disc[0])
+        self._earth = None if disc is None else Earth(*disc)
         self._target = surfaces(_true_body(scenario))
         self._boxes: dict[tuple[Box, ...], Surfaces] = {}
         self._lens = LensMap(camera, scenario.camera.effects.point_spread_px)
         self._size, origin = self._lens.size_px, self._lens.origin_px
-        self._background = Background(
-            camera, origin, self._size, None if disc is None else Earth(*disc)
-        )
+        self._background = Background(camera, origin, self._size, self._earth)
         self._traced, self._to_canvas = _square(camera, origin, self._size)
 
     def render(
@@ -81,7 +79,7 @@ class PathTracedCamera:
         bodies += [(self._of_boxes(tuple(boxes)), p, q) for boxes, p, q in obstacles]
         placed = [(s, (np.asarray(p), np.asarray(q))) for s, p, q in bodies]
         seed = zlib.crc32(np.concatenate([*place, *placed[0][1]]).tobytes())
-        traced = self._tracer.trace(self._traced, place, placed, light, self._to_earth_w, seed)
+        traced = self._tracer.trace(self._traced, place, placed, light, self._earth, seed)
         if self._to_canvas is not None:
             flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
             traced = cv2.warpAffine(

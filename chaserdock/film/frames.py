@@ -132,7 +132,7 @@ def _draw(
 ) -> None:
     """Draw pictures into the folder. A picture is complete where it has its name."""
     tracer, light, disc = PathTracer(samples, variant), light_of(scenario), earth_disc(scenario)
-    to_earth = None if disc is None else np.array(disc[0])
+    earth = None if disc is None else Earth(*disc)
     target, *others = (surfaces(body) for body in _bodies(scenario, chasers))
     for shot in shots:
         look = shot.look
@@ -140,7 +140,7 @@ def _draw(
         bodies = [(target, shot.target), *zip(others, poses, strict=True)]
         seed = int.from_bytes(hashlib.sha256(shot.name.encode()).digest()[:4], "big")
         place = look.eye_m, look.attitude()
-        traced = tracer.trace(look.pinhole(), place, bodies, light, to_earth, seed, smooth=True)
+        traced = tracer.trace(look.pinhole(), place, bodies, light, earth, seed, smooth=True)
         write_image(_file_of(folder, shot), _displayed(traced))
 
 

@@ -4,7 +4,7 @@ that mirrors, light that bodies throw on each other.
 
 The only module that imports ``mitsuba``. Sun, ambient light and lamp have the levels of the fast
 renderer. The Earth and the stars are no bodies: they are drawn behind, as in fast images, and the
-Earth's light comes from its direction.
+Earth's light comes from its disc.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from chaserdock_models.meshes import TriangleMesh, triangle_soup
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
-from chaserdock_world.rendering.background import WHITE_LEVEL, Light
+from chaserdock_world.rendering.background import WHITE_LEVEL, Earth, Light
 from chaserdock_world.rendering.scene_geometry import NEAR_M
 from numpy.typing import NDArray
 
@@ -36,8 +36,10 @@ from chaserdock.analysis.film_bodies import Coat, DressedBody, chaser_body, targ
 _COMPILED, _PLAIN = "llvm_ad_rgb", "scalar_rgb"
 _DEPTH = 4
 """Longest path: light that was reflected by three surfaces."""
-_EARTHSHINE = 0.16
-"""Irradiance of a white Earth over that of the sun: its albedo of 0.3, half of its disc lit."""
+_EARTH_ALBEDO = 0.3
+"""Share of sunlight that the Earth reflects: its mean over sea, land and clouds."""
+_SKY_ROWS = 64
+"""Rows of the map of light from the sky: 3 degrees each, finer than foil mirrors."""
 _EARTH_RGB = (0.55, 0.75, 1.0)
 """Colour (red, green, blue) of the Earth's light relative to white: sea under air and clouds."""
 _WRINKLE_M, _WRINKLE_DEPTH = 0.30, 0.012
@@ -80,7 +82,8 @@ def _try_compiled() -> None:
         (surfaces(body), (np.array([x, 0.0, 0.0]), rotations.IDENTITY))
         for body, x in zip(bodies, (0.0, 0.8), strict=True)
     ]
-    tracer.trace(look.pinhole(), (look.eye_m, look.attitude()), placed, light_of(scenario), None, 0)
+    place, earth = (look.eye_m, look.attitude()), Earth((0.0, 0.0, -1.0), 1.0)
+    tracer.trace(look.pinhole(), place, placed, light_of(scenario), earth, 0)
 
 
 class PathTracer:
@@ -104,22 +107,22 @@ class PathTracer:
         pose: BodyPose,
         bodies: Sequence[tuple[Surfaces, BodyPose]],
         light: Light,
-        to_earth_w: Array | None,
+        earth: Earth | None,
         seed: int,
         smooth: bool = False,
     ) -> NDArray[np.float32]:
         """Return light (red, green, blue; 1 is level 255) and coverage of each pixel (h, w, 4).
 
         ``camera``: without distortion, of square pixels. ``pose``: its place and its attitude, IRF
-        to WRF. ``to_earth_w`` (3,): direction to an Earth that shines, any length. ``smooth``:
-        a pixel weighs light by a Gaussian that is wider than its square, not by the square.
+        to WRF. ``earth``: shines where the sun lights it. ``smooth``: a pixel weighs light by a
+        Gaussian that is wider than its square, not by the square.
         """
         mi = self._mi
         scene: dict[str, Any] = {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": _DEPTH, "hide_emitters": True},
             "sensor": self._sensor(camera, pose, "gaussian" if smooth else "box"),
-        } | _lights(light, to_earth_w, pose[0])
+        } | self._lights(light, earth, pose[0])
         for k, (coated, placed) in enumerate(bodies):
             for n, (coat, surface) in enumerate(coated.items()):
                 scene[f"body_{k}_{n}"] = self._mesh(coat, surface, placed)
@@ -152,6 +155,25 @@ class PathTracer:
             # Stratified, also in the choice of the light: a third of the noise on sunlit white.
             "sampler": {"type": "multijitter", "sample_count": self._samples},
         }
+
+    def _lights(self, light: Light, earth: Earth | None, lamp_m: Array) -> dict[str, Any]:
+        """Return the sources of light; a white face in full sun and ambient light has level 235."""
+        white = WHITE_LEVEL / 255.0
+        if earth is None:
+            sky = {"type": "constant", "radiance": _rgb((white * light.ambient,) * 3)}
+        else:
+            sky = {"type": "envmap", "bitmap": self._mi.Bitmap(_sky(light, earth))}
+        sources: dict[str, Any] = {"sky": sky}
+        if light.sun > 0.0:
+            sources["sun"] = {
+                "type": "directional",
+                "direction": (-light.direction_w).tolist(),
+                "irradiance": _rgb((math.pi * white * light.sun,) * 3),
+            }
+        if light.lamp > 0.0:
+            intensity = _rgb((math.pi * light.lamp / 255.0,) * 3)
+            sources["lamp"] = {"type": "point", "position": lamp_m.tolist(), "intensity": intensity}
+        return sources
 
     def _mesh(self, coat: Coat, surface: tuple[Array, Array, Array], pose: BodyPose) -> Any:
         mi, (corners, normals, uv) = self._mi, surface
@@ -214,28 +236,27 @@ class PathTracer:
         return diffuse
 
 
-def _lights(light: Light, to_earth_w: Array | None, lamp_m: Array) -> dict[str, Any]:
-    """Return the sources of light; a white face that they light fully has level 235."""
-    white = WHITE_LEVEL / 255.0
-    sources = {"ambient": {"type": "constant", "radiance": _rgb((white * light.ambient,) * 3)}}
-    sun = math.pi * white * light.sun
-    if sun > 0.0:
-        sources["sun"] = _directional(-light.direction_w, (sun,) * 3)
-        if to_earth_w is not None:
-            r, g, b = (_EARTHSHINE * sun * c for c in _EARTH_RGB)
-            sources["earth"] = _directional(-to_earth_w, (r, g, b))
-    if light.lamp > 0.0:
-        intensity = _rgb((math.pi * light.lamp / 255.0,) * 3)
-        sources["lamp"] = {"type": "point", "position": lamp_m.tolist(), "intensity": intensity}
-    return sources
+def _sky(light: Light, earth: Earth) -> NDArray[np.float32]:
+    """Return the radiance (n, 2 n, 3) of ambient light and the Earth by polar angle from Y and
+    longitude from -Z to X, WRF.
+    """
+    polar = (np.arange(_SKY_ROWS) + 0.5)[:, None] * np.pi / _SKY_ROWS
+    longitude = (np.arange(2 * _SKY_ROWS) + 0.5) * np.pi / _SKY_ROWS
+    x, z = np.sin(polar) * np.sin(longitude), -np.sin(polar) * np.cos(longitude)
+    rays = np.stack([x, np.broadcast_to(np.cos(polar), x.shape), z], axis=-1)
+    centre = np.array(earth.direction_w) / np.linalg.norm(earth.direction_w)
+    # A sphere of this radius at distance 1, as behind the bodies.
+    radius, cosine = math.sin(earth.radius_rad), rays @ centre
+    inside = cosine**2 - (1.0 - radius**2)
+    distance = cosine - np.sqrt(np.maximum(inside, 0.0))
+    normals = (distance[..., None] * rays - centre) / radius
+    day = np.maximum(normals @ light.direction_w, 0.0) * ((inside > 0.0) & (cosine > 0.0))
+    shine = _EARTH_ALBEDO * light.sun * day[..., None] * np.array(_EARTH_RGB)
+    return (WHITE_LEVEL / 255.0 * (light.ambient + shine)).astype(np.float32)
 
 
 def _rgb(values: Any) -> dict[str, Any]:
     return {"type": "rgb", "value": [float(v) for v in values]}
-
-
-def _directional(along: Array, irradiance: tuple[float, ...]) -> dict[str, Any]:
-    return {"type": "directional", "direction": along.tolist(), "irradiance": _rgb(irradiance)}
 
 
 def surfaces(body: DressedBody) -> Surfaces:

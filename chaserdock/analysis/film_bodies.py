@@ -9,7 +9,7 @@ where these are outside of the cuboid; probe and lens at theirs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -79,9 +79,15 @@ _COATS = {
 
 def coat_of(material: Material) -> Coat:
     """Return the coat of a material; grey for one that is not of a shipped satellite."""
+    return _COATS.get(material.name, grey_coat(material))
+
+
+def grey_coat(material: Material) -> Coat:
+    """Return the coat of a material with the grey reflectances of the cameras' images."""
     d, s = material.diffuse, material.specular
-    grey = Coat((d, d, d), (s, s, s), material.shininess, material.texture)
-    return _COATS.get(material.name, grey)
+    known = _COATS.get(material.name)
+    metal = known is not None and known.metal
+    return Coat((d, d, d), (s, s, s), material.shininess, material.texture, metal)
 
 
 @dataclass
@@ -133,7 +139,7 @@ def target_body(scenario: FlightScenario) -> DressedBody:
     model = scenario.target_model()
     for shape in model.boxes:
         body.add(FOIL, _cuboid("box", shape))
-    _add_markers(body, model)
+    add_markers(body, model, MARKER, _LIFT_M)
     for port in scenario.docking.ports:
         radius_m = scenario.docking.tolerances.lateral_m
         rings = ((radius_m, METAL, 4), (0.6 * radius_m, BLACK, 5))
@@ -266,15 +272,19 @@ def _paint_number(
     body.add_quads(WHITE, quads, 3 * _LIFT_M)
 
 
-def _add_markers(body: DressedBody, model: TargetModel) -> None:
-    """Add the markers of a target: white borders, black squares, white cells."""
+def add_markers(
+    body: DressedBody, model: TargetModel, coats: Mapping[int, Coat], lift_m: float
+) -> None:
+    """Add the markers of a target: white borders, black squares, white cells, each ``lift_m`` above
+    the last. ``coats``: of white (242) and black (13).
+    """
     layers: list[tuple[list[Array], int]] = [([], 242), ([], 13), ([], 242)]
     for marker in model.markers:
         border, square, *cells = marker_decals(model, marker)
         for (quads, _), new in zip(layers, ([border], [square], cells), strict=True):
             quads += [_within(model.boxes, quad)[[3, 2, 1, 0]] for quad, _ in new]
     for layer, (quads, grey) in enumerate(layers):
-        body.add_quads(MARKER[grey], quads, (layer + 1) * _LIFT_M)
+        body.add_quads(coats[grey], quads, (layer + 1) * lift_m)
 
 
 def _within(boxes: Sequence[Box], quad: Array) -> Array:

@@ -18,6 +18,7 @@ from .options import (
     LinkOptions,
     LogArg,
     QuietOpt,
+    RendererOption,
     ToOpt,
     errors_as_json,
     fail,
@@ -186,13 +187,6 @@ def _draw_cameras(log: Path, out: Path, at_s: float, width: int) -> None:
     write_image(out, snapshot(log, at_s, width))
 
 
-class FilmRenderer(StrEnum):
-    """What draws the bodies of a film."""
-
-    fast = "fast"
-    path = "path"
-
-
 def video(
     context: typer.Context,
     log: LogArg,
@@ -207,8 +201,8 @@ def video(
     to_s: ToOpt = None,
     quality: Annotated[int, typer.Option(min=0, max=100, help=".webp: image quality")] = 60,
     renderer: Annotated[
-        FilmRenderer, typer.Option(help="fast: as the cameras; path: path tracing, needs mitsuba")
-    ] = FilmRenderer.fast,
+        RendererOption, typer.Option(help="fast: as the cameras; path: path tracing, needs mitsuba")
+    ] = RendererOption.fast,
     samples: Annotated[
         int, typer.Option(min=1, max=4096, help="--renderer path: paths of light per pixel")
     ] = 16,
@@ -222,7 +216,7 @@ def video(
     """
     from chaserdock.analysis.video import write_video
 
-    if renderer is not FilmRenderer.path:
+    if renderer is not RendererOption.path:
         refuse_options(context, ("samples", "jobs"), "only with --renderer path")
     window_s = (from_s, float("inf") if to_s is None else to_s)
     number = write_video(

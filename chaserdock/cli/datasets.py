@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import JsonOpt, SetOpt, complete_scenario, fail, print_result, refuse_options
+from .options import (
+    JsonOpt,
+    RendererOption,
+    SetOpt,
+    complete_scenario,
+    fail,
+    print_result,
+    refuse_options,
+)
 
 if TYPE_CHECKING:
     from chaserdock.datasets.types import Selection
@@ -97,6 +105,16 @@ def dataset(
     validation: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="--out: share of the images for validation")
     ] = 0.2,
+    renderer: Annotated[
+        RendererOption,
+        typer.Option(
+            help="--out: fast: as the simulated cameras; path: path tracing, needs mitsuba"
+        ),
+    ] = RendererOption.fast,
+    samples: Annotated[
+        int, typer.Option(min=1, max=4096, help="--renderer path: paths of light per pixel")
+    ] = 64,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="--renderer path: processors")] = 1,
     overrides: SetOpt = None,
     name: Annotated[
         str | None,
@@ -137,7 +155,10 @@ def dataset(
     of a scenario's target with pose labels, in the SPEED+ and BOP formats.
     """
     if out is None:
-        drawing = ("layout", "seed", "range_m", "offset", "phase", "validation", "overrides")
+        drawing = (
+            "layout", "seed", "range_m", "offset", "phase", "validation", "overrides", "renderer",
+            "samples", "jobs",
+        )  # fmt: skip
         refuse_options(context, drawing, "only with --out")
         from chaserdock.datasets.types import Selection
 
@@ -148,6 +169,8 @@ def dataset(
     refuse_options(context, scoring, "not with --out")
     if images is None:
         raise fail("--images: needed with --out")
+    if renderer is not RendererOption.path:
+        refuse_options(context, ("samples", "jobs"), "only with --renderer path")
 
     from chaserdock_protocol.scenario import load_scenario
     from chaserdock_protocol.shipped_scenarios import find_scenario
@@ -163,7 +186,10 @@ def dataset(
         ("bop", "speed+") if layout is LayoutOption.both else (layout.value,)
     )
     progress = _show_progress("image", images, quiet)
-    export_dataset(loaded, out, images, limits, layouts, validation, progress)
+    export_dataset(
+        loaded, out, images, limits, layouts, validation, progress,
+        samples if renderer is RendererOption.path else None, jobs,
+    )  # fmt: skip
     print(f"{out}: {images} images of {loaded.target.model}, {' and '.join(layouts)}, seed {seed}")
 
 

@@ -40,6 +40,13 @@ class ModeOption(StrEnum):
     realtime = "realtime"
 
 
+class RendererOption(StrEnum):
+    """What draws bodies."""
+
+    fast = "fast"
+    path = "path"
+
+
 class NetMode(StrEnum):
     """Zenoh session modes of a process."""
 

@@ -34,18 +34,26 @@ def export_dataset(
     layouts: tuple[Layout, ...],
     validation_share: float = 0.2,
     progress: Callable[[int], None] = lambda done: None,
+    path_samples: int | None = None,
+    jobs: int = 1,
 ) -> None:
     """Write ``images`` labelled images into a new ``folder``. The last ones, a share of
-    ``validation_share``, are for validation.
+    ``validation_share``, are for validation. ``path_samples``: trace so many paths of light a
+    pixel, on ``jobs`` processors, by the extra ``film``; None: the world's renderer.
 
     Raises DatasetError for a folder that is not empty or cannot be written, and for a camera with
-    errors.
+    errors; ChaserdockError without the extra.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DatasetError(f"{folder}: exists already; give a new folder")
     for layout in layouts:
         check_camera(scenario.camera_model(), layout)
-    renderer = ViewRenderer(scenario, limits)
+    tracer = None
+    if path_samples is not None:
+        from chaserdock.film.camera_images import path_tracing
+
+        tracer = path_tracing(scenario, path_samples, jobs)
+    renderer = ViewRenderer(scenario, limits, tracer)
     first_validation = images - round(validation_share * images)
     with errors_of_writing(folder, DatasetError):
         folder.mkdir(parents=True, exist_ok=True)
@@ -60,10 +68,12 @@ def export_dataset(
             progress(number + 1)
         for writer in writers:
             writer.close()
-        write_atomically(folder / DESCRIPTION, _description(scenario, images, limits))
+        write_atomically(folder / DESCRIPTION, _description(scenario, images, limits, path_samples))
 
 
-def _description(scenario: Scenario, images: int, limits: ViewLimits) -> str:
+def _description(
+    scenario: Scenario, images: int, limits: ViewLimits, path_samples: int | None
+) -> str:
     facts = {
         "format": 1,
         "chaserdock": version("chaserdock"),
@@ -71,6 +81,8 @@ def _description(scenario: Scenario, images: int, limits: ViewLimits) -> str:
         "seed": scenario.seed,
         "images": images,
         "limits": asdict(limits),
+        "renderer": "fast" if path_samples is None else "path",
+        "path_samples": path_samples,
         "flight_scenario": json.loads(flight_scenario_json(scenario)),
     }
     return json.dumps(facts, indent=1) + "\n"

@@ -9,6 +9,7 @@ dataset begins with the shorter one.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.plant import true_mesh, true_target
 from chaserdock_world.rendering.background import WHITE_LEVEL, Light
-from chaserdock_world.rendering.cameras import Cameras
+from chaserdock_world.rendering.cameras import Cameras, SceneRenderer
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer, mesh_of_boxes
 from chaserdock_world.rendering.scene_geometry import Obstacle
 from chaserdock_world.sensors.errors import true_camera
@@ -131,11 +132,17 @@ class ViewRenderer:
     """Renders random views of a scenario's target by the camera of chaser 0, with the scenario's
     light and effects.
 
-    The camera has no errors against its calibration. Raises DatasetError for a scenario in which it
+    ``renderer_of``: makes another renderer of the images; masks are drawn by the world's. The
+    camera has no errors against its calibration. Raises DatasetError for a scenario in which it
     has.
     """
 
-    def __init__(self, scenario: Scenario, limits: ViewLimits) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        limits: ViewLimits,
+        renderer_of: Callable[[Camera], SceneRenderer] | None = None,
+    ) -> None:
         self.camera = scenario.camera_model()
         if true_camera(scenario, 0) != self.camera:
             raise DatasetError(
@@ -143,7 +150,7 @@ class ViewRenderer:
                 "the errors of the camera"
             )
         self._scenario, self._limits = scenario, limits
-        self._cameras = Cameras(scenario)
+        self._cameras = Cameras(scenario, renderer_of)
         self._to_sun_w = np.array(self._cameras.light_at(0.0).direction_w)
         self.mesh = target_mesh(scenario)
         self.shape = shape_of(self.mesh, symmetric=not true_target(scenario).markers)

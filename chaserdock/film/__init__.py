@@ -1,2 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Path-traced films (optional: extra ``film``): the entry is `frames.PathTracedBodies`."""
+"""Path-traced images (optional: extra ``film``). The entries are `frames.PathTracedBodies` for
+films and `camera_images.path_tracing` for datasets.
+"""

@@ -17,13 +17,18 @@ from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.orbit import earth_disc
 from chaserdock_world.rendering.background import Background, Earth
+from numpy.typing import NDArray
 
-from chaserdock.analysis.body_renderer import coloured_space, light_of, shown
+from chaserdock.analysis.body_renderer import GAMMA, coloured_space, light_of, reflectance, shown
 from chaserdock.analysis.chase_camera import BgrImage, RenderedBodies, Shot, Viewpoint
+from chaserdock.analysis.film_bodies import DressedBody, chaser_body, target_body
 from chaserdock.images import write_image
 
-from .path_tracer import PathTracer, fastest_variant, require_mitsuba
+from .path_tracer import PathTracer, fastest_variant, require_mitsuba, surfaces
 
+_DENOISE, _DENOISE_COLOUR = 5.0, 6.0
+"""Strength of the denoising of brightness and colour, grey levels: the noise of 16 samples is
+about twice that."""
 _PROGRESS_S = 1.0
 """Interval, s, at which the number of pictures is shown."""
 PLAN = "plan.txt"
@@ -87,6 +92,11 @@ class PathTracedBodies:
 def _plan_of(scenario: Scenario, shots: Sequence[Shot], samples: int) -> str:
     """Return a digest of all that the pictures depend on."""
     digest = hashlib.sha256(scenario.model_dump_json().encode())
+    # A mesh is a file of which the scenario has but the name.
+    for body in _bodies(scenario, sorted({i for shot in shots for i in shot.chasers})):
+        for part, coat in body.parts:
+            digest.update(f"{coat!r} {part.triangles.shape}".encode())
+            digest.update(part.vertices_m.round(9).tobytes() + part.triangles.tobytes())
     for shot in shots:
         poses = [shot.target, *shot.chasers.values()]
         numbers = np.concatenate([np.concatenate(pose) for pose in poses]).round(9)
@@ -121,8 +131,30 @@ def _draw(
     variant: str,
 ) -> None:
     """Draw pictures into the folder. A picture is complete where it has its name."""
-    tracer = PathTracer(scenario, chasers, samples, variant)
+    tracer, light, disc = PathTracer(samples, variant), light_of(scenario), earth_disc(scenario)
+    earth = None if disc is None else Earth(*disc)
+    target, *others = (surfaces(body) for body in _bodies(scenario, chasers))
     for shot in shots:
+        look = shot.look
+        poses = [shot.chasers[i] for i in chasers]
+        bodies = [(target, shot.target), *zip(others, poses, strict=True)]
         seed = int.from_bytes(hashlib.sha256(shot.name.encode()).digest()[:4], "big")
-        image = tracer.render(shot.look, shot.target, shot.chasers, seed)
-        write_image(_file_of(folder, shot), image)
+        place = look.eye_m, look.attitude()
+        traced = tracer.trace(look.pinhole(), place, bodies, light, earth, seed, smooth=True)
+        write_image(_file_of(folder, shot), _displayed(traced))
+
+
+def _bodies(scenario: Scenario, chasers: Sequence[int]) -> list[DressedBody]:
+    """Return the target and chasers."""
+    return [target_body(scenario), *(chaser_body(scenario, i, reflectance(i)) for i in chasers)]
+
+
+def _displayed(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return light and coverage (h, w, 4) as denoised levels for display, BGR and coverage."""
+    cover = np.clip(image[:, :, 3:4], 0.0, 1.0)
+    light = image[:, :, 2::-1] / np.maximum(cover, 1e-3)
+    levels = np.clip(255.0 * light, 0.0, 255.0)
+    # Exponent before rounding: the dark half has more levels then.
+    bright = np.asarray((255.0 * (levels / 255.0) ** GAMMA).astype(np.uint8))
+    denoised = cv2.fastNlMeansDenoisingColored(bright, None, _DENOISE, _DENOISE_COLOUR, 5, 15)
+    return np.dstack([denoised, 255.0 * cover]).astype(np.uint8)

@@ -2,9 +2,9 @@
 """Traces paths of light from the camera through a scene with Mitsuba 3: soft and cast shadows, foil
 that mirrors, light that bodies throw on each other.
 
-The only module that imports ``mitsuba``. Sun, ambient light and reflectances are those of the fast
-renderer. The Earth and the stars are no bodies: they are drawn behind, as in the fast film, and the
-Earth's light comes from its direction.
+The only module that imports ``mitsuba``. Sun, ambient light and lamp have the levels of the fast
+renderer. The Earth and the stars are no bodies: they are drawn behind, as in fast images, and the
+Earth's light comes from its disc.
 """
 
 from __future__ import annotations
@@ -13,30 +13,33 @@ import importlib.util
 import math
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.camera import Camera
 from chaserdock_models.meshes import TriangleMesh, triangle_soup
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
-from chaserdock_world.orbit import earth_disc, to_sun
-from chaserdock_world.rendering.background import WHITE_LEVEL
+from chaserdock_world.rendering.background import WHITE_LEVEL, Earth, Light
+from chaserdock_world.rendering.scene_geometry import NEAR_M
 from numpy.typing import NDArray
 
-from chaserdock.analysis.body_renderer import AMBIENT, GAMMA, reflectance
+from chaserdock.analysis.body_renderer import light_of, reflectance
 from chaserdock.analysis.chase_camera import BodyPose, Viewpoint
 from chaserdock.analysis.film_bodies import Coat, DressedBody, chaser_body, target_body
 
 _COMPILED, _PLAIN = "llvm_ad_rgb", "scalar_rgb"
 _DEPTH = 4
 """Longest path: light that was reflected by three surfaces."""
-_EARTHSHINE = 0.16
-"""Irradiance of a white Earth over that of the sun: its albedo of 0.3, half of its disc lit."""
+_EARTH_ALBEDO = 0.3
+"""Share of sunlight that the Earth reflects: its mean over sea, land and clouds."""
+_SKY_ROWS = 64
+"""Rows of the map of light from the sky: 3 degrees each, finer than foil mirrors."""
 _EARTH_RGB = (0.55, 0.75, 1.0)
 """Colour (red, green, blue) of the Earth's light relative to white: sea under air and clouds."""
 _WRINKLE_M, _WRINKLE_DEPTH = 0.30, 0.012
@@ -48,16 +51,15 @@ _ROUGH_FOIL, _ROUGH_METAL, _ROUGH_PLASTIC = 0.22, 0.30, 0.12
 _MIRROR_SHARE = 0.45
 """Share of a metal's reflection that is a mirror's; the rest is diffuse, of wrinkles finer than a
 pixel. Without it, foil in black space is black."""
-_DENOISE, _DENOISE_COLOUR = 5.0, 6.0
-"""Strength of the denoising of brightness and colour, grey levels: the noise of 16 samples is
-about twice that."""
+Surfaces = dict[Coat, tuple[Array, Array, Array]]
+"""By coat, of its m triangles: corners and normals (3 m, 3), texture coordinates (3 m, 2), m."""
 
 
 def require_mitsuba() -> None:
     """Raise ChaserdockError where the package is not installed."""
     if importlib.util.find_spec("mitsuba") is None:
         raise ChaserdockError(
-            "path-traced films need mitsuba, which is not installed; pip install -e '.[film]'"
+            "path tracing needs mitsuba, which is not installed; pip install -e '.[film]'"
         )
 
 
@@ -74,80 +76,104 @@ def fastest_variant() -> str:
 def _try_compiled() -> None:
     """Render a small picture of all coats with the compiled variant."""
     scenario = load_scenario(find_scenario("demo"))
-    look = Viewpoint(np.zeros(3), 3.0, 0.5, 0.5, 16, 16)
-    poses = [(np.array([x, 0.0, 0.0]), rotations.IDENTITY) for x in (0.0, 0.8)]
-    PathTracer(scenario, (0,), 1, _COMPILED).render(look, poses[0], {0: poses[1]}, 0)
+    tracer, look = PathTracer(1, _COMPILED), Viewpoint(np.zeros(3), 3.0, 0.5, 0.5, 16, 16)
+    bodies = (target_body(scenario), chaser_body(scenario, 0, reflectance(0)))
+    placed = [
+        (surfaces(body), (np.array([x, 0.0, 0.0]), rotations.IDENTITY))
+        for body, x in zip(bodies, (0.0, 0.8), strict=True)
+    ]
+    place, earth = (look.eye_m, look.attitude()), Earth((0.0, 0.0, -1.0), 1.0)
+    tracer.trace(look.pinhole(), place, placed, light_of(scenario), earth, 0)
 
 
 class PathTracer:
-    """Renders the bodies of one scenario on one processor. ``chasers``: numbers; ``samples``:
-    paths a pixel; ``variant``: of Mitsuba.
+    """Traces light to a camera. ``samples``: paths a pixel; ``variant``: of Mitsuba;
+    ``threads``: that share an image.
     """
 
-    def __init__(
-        self, scenario: Scenario, chasers: tuple[int, ...], samples: int, variant: str = _PLAIN
-    ) -> None:
+    def __init__(self, samples: int, variant: str = _PLAIN, threads: int = 1) -> None:
         mitsuba: Any = importlib.import_module("mitsuba")
         mitsuba.set_variant(variant)
         mitsuba.set_log_level(mitsuba.LogLevel.Error)
         drjit: Any = importlib.import_module("drjit")
-        drjit.set_thread_count(1)  # frames are in parallel
+        drjit.set_thread_count(threads)
         self._mi = mitsuba
         self._samples = samples
-        self._sun, self._disc = np.array(to_sun(scenario)), earth_disc(scenario)
-        self._target = _surfaces(target_body(scenario))
-        self._chasers = {i: _surfaces(chaser_body(scenario, i, reflectance(i))) for i in chasers}
         self._bsdfs: dict[Coat, Any] = {}
 
-    def render(
-        self, look: Viewpoint, target: BodyPose, chasers: Mapping[int, BodyPose], seed: int
-    ) -> NDArray[np.uint8]:
-        """Return the picture (h, w, 4): blue, green, red for display, and coverage."""
+    def trace(
+        self,
+        camera: Camera,
+        pose: BodyPose,
+        bodies: Sequence[tuple[Surfaces, BodyPose]],
+        light: Light,
+        earth: Earth | None,
+        seed: int,
+        smooth: bool = False,
+    ) -> NDArray[np.float32]:
+        """Return light (red, green, blue; 1 is level 255) and coverage of each pixel (h, w, 4).
+
+        ``camera``: without distortion, of square pixels. ``pose``: its place and its attitude, IRF
+        to WRF. ``earth``: shines where the sun lights it. ``smooth``: a pixel weighs light by a
+        Gaussian that is wider than its square, not by the square.
+        """
         mi = self._mi
         scene: dict[str, Any] = {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": _DEPTH, "hide_emitters": True},
-            "sensor": self._sensor(look),
-        } | self._lights()
-        bodies = [(self._target, target)] + [(self._chasers[i], chasers[i]) for i in chasers]
-        for k, (surfaces, pose) in enumerate(bodies):
-            for n, (coat, surface) in enumerate(surfaces.items()):
-                scene[f"body_{k}_{n}"] = self._mesh(coat, surface, pose)
+            "sensor": self._sensor(camera, pose, "gaussian" if smooth else "box"),
+        } | self._lights(light, earth, pose[0])
+        for k, (coated, placed) in enumerate(bodies):
+            for n, (coat, surface) in enumerate(coated.items()):
+                scene[f"body_{k}_{n}"] = self._mesh(coat, surface, placed)
         image = np.array(mi.render(mi.load_dict(scene), spp=self._samples, seed=seed))
-        return _displayed(image)
+        return np.nan_to_num(image.astype(np.float32))
 
-    def _sensor(self, look: Viewpoint) -> dict[str, Any]:
-        mi, (w, h) = self._mi, (look.width_px, look.height_px)
-        _, up, _ = look.axes()
-        x, y = look.principal_px
-        transform = mi.ScalarTransform4f().look_at(
-            origin=look.eye_m.tolist(), target=look.centre_m.tolist(), up=up.tolist()
-        )
+    def _sensor(self, camera: Camera, pose: BodyPose, pixel_filter: str) -> dict[str, Any]:
+        w, h = camera.width_px, camera.height_px
+        # Mitsuba's cameras look along +Z, too, but X is left and Y is up.
+        to_world = np.eye(4)
+        to_world[:3, :3] = rotations.to_matrix(pose[1]) * (-1.0, -1.0, 1.0)
+        to_world[:3, 3] = pose[0]
         return {
             "type": "perspective",
             "fov_axis": "x",
-            "fov": math.degrees(2.0 * math.atan(0.5 * w / look.focal_px)),
-            "near_clip": 0.01,
+            "fov": math.degrees(2.0 * math.atan(0.5 * w / camera.fx_px)),
+            "near_clip": NEAR_M,
             "far_clip": 1e3,
-            "principal_point_offset_x": 0.5 - x / w,
-            "principal_point_offset_y": 0.5 - y / h,
-            "to_world": transform,
-            "film": _film((w, h)),
+            # Its first pixel begins at 0; ours has its centre there.
+            "principal_point_offset_x": 0.5 - (camera.cx_px + 0.5) / w,
+            "principal_point_offset_y": 0.5 - (camera.cy_px + 0.5) / h,
+            "to_world": self._mi.ScalarTransform4f(to_world.tolist()),
+            "film": {
+                "type": "hdrfilm",
+                "width": w,
+                "height": h,
+                "pixel_format": "rgba",
+                "rfilter": {"type": pixel_filter},
+            },
             # Stratified, also in the choice of the light: a third of the noise on sunlit white.
             "sampler": {"type": "multijitter", "sample_count": self._samples},
         }
 
-    def _lights(self) -> dict[str, Any]:
+    def _lights(self, light: Light, earth: Earth | None, lamp_m: Array) -> dict[str, Any]:
+        """Return the sources of light; a white face in full sun and ambient light has level 235."""
         white = WHITE_LEVEL / 255.0
-        sun = math.pi * white * (1.0 - AMBIENT)
-        lights = {
-            "ambient": {"type": "constant", "radiance": _rgb((white * AMBIENT,) * 3)},
-            "sun": _directional(-self._sun, (sun,) * 3),
-        }
-        if self._disc is not None:
-            r, g, b = (_EARTHSHINE * sun * c for c in _EARTH_RGB)
-            lights["earth"] = _directional(-np.array(self._disc[0]), (r, g, b))
-        return lights
+        if earth is None:
+            sky = {"type": "constant", "radiance": _rgb((white * light.ambient,) * 3)}
+        else:
+            sky = {"type": "envmap", "bitmap": self._mi.Bitmap(_sky(light, earth))}
+        sources: dict[str, Any] = {"sky": sky}
+        if light.sun > 0.0:
+            sources["sun"] = {
+                "type": "directional",
+                "direction": (-light.direction_w).tolist(),
+                "irradiance": _rgb((math.pi * white * light.sun,) * 3),
+            }
+        if light.lamp > 0.0:
+            intensity = _rgb((math.pi * light.lamp / 255.0,) * 3)
+            sources["lamp"] = {"type": "point", "position": lamp_m.tolist(), "intensity": intensity}
+        return sources
 
     def _mesh(self, coat: Coat, surface: tuple[Array, Array, Array], pose: BodyPose) -> Any:
         mi, (corners, normals, uv) = self._mi, surface
@@ -210,31 +236,34 @@ class PathTracer:
         return diffuse
 
 
-def _film(size_px: tuple[int, int]) -> dict[str, Any]:
-    return {
-        "type": "hdrfilm",
-        "width": size_px[0],
-        "height": size_px[1],
-        "pixel_format": "rgba",
-        "rfilter": {"type": "gaussian"},
-    }
+def _sky(light: Light, earth: Earth) -> NDArray[np.float32]:
+    """Return the radiance (n, 2 n, 3) of ambient light and the Earth by polar angle from Y and
+    longitude from -Z to X, WRF.
+    """
+    polar = (np.arange(_SKY_ROWS) + 0.5)[:, None] * np.pi / _SKY_ROWS
+    longitude = (np.arange(2 * _SKY_ROWS) + 0.5) * np.pi / _SKY_ROWS
+    x, z = np.sin(polar) * np.sin(longitude), -np.sin(polar) * np.cos(longitude)
+    rays = np.stack([x, np.broadcast_to(np.cos(polar), x.shape), z], axis=-1)
+    centre = np.array(earth.direction_w) / np.linalg.norm(earth.direction_w)
+    # A sphere of this radius at distance 1, as behind the bodies.
+    radius, cosine = math.sin(earth.radius_rad), rays @ centre
+    inside = cosine**2 - (1.0 - radius**2)
+    distance = cosine - np.sqrt(np.maximum(inside, 0.0))
+    normals = (distance[..., None] * rays - centre) / radius
+    day = np.maximum(normals @ light.direction_w, 0.0) * ((inside > 0.0) & (cosine > 0.0))
+    shine = _EARTH_ALBEDO * light.sun * day[..., None] * np.array(_EARTH_RGB)
+    return (WHITE_LEVEL / 255.0 * (light.ambient + shine)).astype(np.float32)
 
 
 def _rgb(values: Any) -> dict[str, Any]:
     return {"type": "rgb", "value": [float(v) for v in values]}
 
 
-def _directional(along: Array, irradiance: tuple[float, ...]) -> dict[str, Any]:
-    return {"type": "directional", "direction": along.tolist(), "irradiance": _rgb(irradiance)}
-
-
-def _surfaces(body: DressedBody) -> dict[Coat, tuple[Array, Array, Array]]:
-    """Return corners, normals (3 m, 3) and texture coordinates (3 m, 2), m, of the m triangles of
-    each coat, body axes.
-    """
+def surfaces(body: DressedBody) -> Surfaces:
+    """Return the surfaces of a body, in its axes."""
     out = {}
     for coat in dict.fromkeys(c for _, c in body.parts):
-        mesh = TriangleMesh("coat", tuple(p for p, c in body.parts if c is coat), {})
+        mesh = TriangleMesh("coat", tuple(p for p, c in body.parts if c == coat), {})
         soup = triangle_soup(mesh)
         corners, normals = soup.corners_m.reshape(-1, 3), soup.normals.reshape(-1, 3)
         # Seen along the axis that the triangle faces most.
@@ -264,17 +293,6 @@ def _cells(rgb: tuple[float, float, float]) -> NDArray[np.float32]:
     image[:, 31:33] = 0.25  # bus bar
     image[:2] = image[-2:] = image[:, :2] = image[:, -2:] = 0.42  # gap to the next one
     return image
-
-
-def _displayed(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return light and coverage (h, w, 4) as denoised levels for display, BGR and coverage."""
-    cover = np.clip(image[:, :, 3:4], 0.0, 1.0)
-    light = image[:, :, 2::-1] / np.maximum(cover, 1e-3)
-    levels = np.clip(255.0 * np.nan_to_num(light), 0.0, 255.0)
-    # Exponent before rounding: the dark half has more levels then.
-    bright = np.asarray((255.0 * (levels / 255.0) ** GAMMA).astype(np.uint8))
-    denoised = cv2.fastNlMeansDenoisingColored(bright, None, _DENOISE, _DENOISE_COLOUR, 5, 15)
-    return np.dstack([denoised, 255.0 * cover]).astype(np.uint8)
 
 
 if __name__ == "__main__":

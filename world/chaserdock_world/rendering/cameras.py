@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.scenario import Scenario
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from chaserdock_world.orbit import TargetOrbit, earth_disc
 from chaserdock_world.physics.simulation import TARGET, BodyState
@@ -43,10 +44,31 @@ _ECLIPSE_AMBIENT = 0.05
 States = dict[str, BodyState]
 
 
-class Cameras:
-    """Make the images of all chasers of a scenario; an image depends on its arguments only."""
+class SceneRenderer(Protocol):
+    """Draws what one camera sees: `Renderer`, `MeshRenderer`, or a renderer from elsewhere."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def render(
+        self,
+        camera_position_w_m: ArrayLike,
+        camera_q_w_irf_wxyz: ArrayLike,
+        target_p_w_m: ArrayLike,
+        target_q_w_trf_wxyz: ArrayLike,
+        obstacles: Sequence[Obstacle] = ...,
+        light: Light = ...,
+    ) -> NDArray[np.uint8]:
+        """Return the image, as `Renderer.render` does."""
+        ...
+
+
+class Cameras:
+    """Make the images of all chasers of a scenario; an image depends on its arguments only.
+
+    ``renderer_of``: makes the renderer of a camera in place of the one that suits the target.
+    """
+
+    def __init__(
+        self, scenario: Scenario, renderer_of: Callable[[Camera], SceneRenderer] | None = None
+    ) -> None:
         self._scenario, section = scenario, scenario.camera
         self._cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
         self._target = true_target(scenario)
@@ -64,7 +86,9 @@ class Cameras:
             substitutes[body] = moved(shape, np.zeros(3), np.array(body.size_m) / (high - low))
 
         @cache
-        def renderer(camera: Camera) -> Renderer | MeshRenderer:
+        def renderer(camera: Camera) -> SceneRenderer:
+            if renderer_of is not None:
+                return renderer_of(camera)
             spread_px = effects.point_spread_px
             if mesh is not None:
                 return MeshRenderer(camera, mesh, background, spread_px, substitutes)

@@ -45,6 +45,7 @@ from chaserdock.analysis.chase_camera import Viewpoint
 from chaserdock.analysis.figures import (
     FIGURES,
     _FewTicks,
+    approach,
     cameras,
     consistency_text,
     docking,
@@ -390,12 +391,35 @@ def test_charts_have_the_values_of_the_figures(tmp_path: Path) -> None:
     curve = panel["curves"][-1]
     assert curve["colour"] == "--series-1"
     x, y = (
-        np.frombuffer(base64.b64decode(charts.arrays[curve[k]]), dtype="<f4") for k in ("x", "y")
+        np.frombuffer(base64.b64decode(charts.pool.arrays[curve[k]]), dtype="<f4")
+        for k in ("x", "y")
     )
     time_s, distance_m = flight.motion["chaser/1"].distance_to(flight.motion["target"])
     np.testing.assert_allclose(x, time_s, rtol=1e-6)
     np.testing.assert_allclose(y, distance_m, rtol=1e-6)
-    assert panel["x"] == [0.0, pytest.approx(20.0)]
+    assert panel["x"]["ends"] == [0.0, pytest.approx(20.0)]
+
+
+def test_charts_are_of_any_x_axis_and_have_bars(tmp_path: Path) -> None:
+    """Over a range that runs to the right in time, and with an image's outcome in each row."""
+    flight = with_references(
+        tmp_path / "a.mcap", "docking-contact", [(0.0, "hold"), (1.0, "final")]
+    )
+    charts, traces = ChartData(), load_traces(tmp_path / "a.mcap", flight.scenario)
+    for name, draw in (("approach", approach), ("cameras", cameras)):
+        figure = draw(flight, traces)
+        figure.draw_without_rendering()
+        charts.add(name, figure)
+    lateral, closing = charts.figures["approach"]
+    assert lateral["over"] == closing["over"] == "range / mm"
+    assert (lateral["x"]["direction"], lateral["time"]) == (-1, False)
+    assert [limit["x"] for limit in lateral["limits"]][-1] == [0.0, 0.0]  # at contact
+    top, _ = charts.figures["cameras"]
+    assert top["time"]
+    assert top["y"]["names"] == [(0.0, "chaser 0")]
+    (bar,) = top["bars"]
+    assert bar["y"] == pytest.approx([-0.36, 0.36])
+    assert bar["colour"] == "--grid"  # nothing seen
 
 
 def test_approach_is_measured_from_the_port(tmp_path: Path) -> None:

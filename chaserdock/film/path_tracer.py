@@ -20,7 +20,6 @@ import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.meshes import TriangleMesh, triangle_soup
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
@@ -28,9 +27,15 @@ from chaserdock_world.orbit import earth_disc, to_sun
 from chaserdock_world.rendering.background import WHITE_LEVEL
 from numpy.typing import NDArray
 
-from chaserdock.analysis.body_renderer import AMBIENT, GAMMA, reflectance
 from chaserdock.analysis.chase_camera import BodyPose, Viewpoint
-from chaserdock.analysis.film_bodies import Coat, DressedBody, chaser_body, target_body
+from chaserdock.analysis.dressed_bodies import (
+    AMBIENT,
+    GAMMA,
+    Coat,
+    DressedBody,
+    chaser_body,
+    target_body,
+)
 
 _COMPILED, _PLAIN = "llvm_ad_rgb", "scalar_rgb"
 _DEPTH = 4
@@ -96,7 +101,7 @@ class PathTracer:
         self._samples = samples
         self._sun, self._disc = np.array(to_sun(scenario)), earth_disc(scenario)
         self._target = _surfaces(target_body(scenario))
-        self._chasers = {i: _surfaces(chaser_body(scenario, i, reflectance(i))) for i in chasers}
+        self._chasers = {i: _surfaces(chaser_body(scenario, i)) for i in chasers}
         self._bsdfs: dict[Coat, Any] = {}
 
     def render(
@@ -233,9 +238,7 @@ def _surfaces(body: DressedBody) -> dict[Coat, tuple[Array, Array, Array]]:
     each coat, body axes.
     """
     out = {}
-    for coat in dict.fromkeys(c for _, c in body.parts):
-        mesh = TriangleMesh("coat", tuple(p for p, c in body.parts if c is coat), {})
-        soup = triangle_soup(mesh)
+    for coat, soup in body.surfaces().items():
         corners, normals = soup.corners_m.reshape(-1, 3), soup.normals.reshape(-1, 3)
         # Seen along the axis that the triangle faces most.
         first, second, third = np.moveaxis(soup.corners_m, 1, 0)

@@ -13,7 +13,7 @@ from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import NDArray
 
-from chaserdock.analysis.dressed_bodies import GAMMA, Coat, DressedBody
+from chaserdock.analysis.dressed_bodies import Coat, DressedBody
 
 _HIGHLIGHT = 0.3
 """Share of the highlight in the colour of a body, chosen: foil is golden. Larger: cells are
@@ -62,11 +62,11 @@ def mesh_of(body: DressedBody) -> Mesh:
 
 
 def _shown(coat: Coat) -> Array:
-    """Return the colour (3,), 0 to 255, of a coat in the sun with a part of its highlight: what
+    """Return the colour (3,), 0 to 255, linear, of a coat with a part of its highlight: what
     mirrors is dark without its surroundings.
     """
     level = np.array(coat.rgb) + _HIGHLIGHT * np.array(coat.specular)
-    return 255.0 * np.clip(level, 0.0, 1.0) ** GAMMA
+    return 255.0 * np.clip(level, 0.0, 1.0)
 
 
 def polyline(points: Array) -> NDArray[np.float32]:

@@ -42,6 +42,7 @@ from chaserdock.analysis.approach import approach_of
 from chaserdock.analysis.body_renderer import BodyRenderer
 from chaserdock.analysis.charts import ChartData
 from chaserdock.analysis.chase_camera import Viewpoint
+from chaserdock.analysis.dressed_bodies import chaser_body, target_body
 from chaserdock.analysis.figures import (
     FIGURES,
     _FewTicks,
@@ -60,7 +61,6 @@ from chaserdock.analysis.flight import RecordedFlight, ReferenceHistory, load_fl
 from chaserdock.analysis.images import columns_for, pairs, shots
 from chaserdock.analysis.plots import AXES_XYZ, SERIES, MissingData, new_figure, save
 from chaserdock.analysis.report import _chasers, report_of, table, write_report
-from chaserdock.analysis.scene import scene_of
 from chaserdock.analysis.summary import summary_of, text_of, tracking_components, tracking_errors
 from chaserdock.analysis.time_series import (
     OUTCOMES,
@@ -216,6 +216,19 @@ def test_replay_data_equal_the_recorded_motion(short_flight: Path, page: Page) -
     for urls in data["images"]["chasers"].values():
         assert len(urls) == len(data["images"]["times"]) > 0
         assert all(url.startswith("data:image/jpeg;base64,") for url in urls)
+
+
+def test_replay_draws_the_bodies_of_the_film(short_flight: Path, page: Page) -> None:
+    data, flown = json.loads(page.data), load_flight(short_flight / "mission.mcap").scenario
+    shown = [(data["target"]["body"], target_body(flown))]
+    shown += [(data["chasers"][i]["body"], chaser_body(flown, i)) for i in (0, 1)]
+    for stored, body in shown:
+        found = zip(stored["coats"], body.surfaces().items(), strict=True)
+        for k, (coat, soup) in found:
+            assert k["rgb"] == list(coat.rgb)
+            units = np.frombuffer(base64.b64decode(data["arrays"][k["corners"]]), dtype="<i2")
+            corners = stored["unit_m"] * units.reshape(-1, 3, 3)
+            np.testing.assert_allclose(corners, soup.corners_m, atol=4e-5)
 
 
 def test_every_figure_is_described() -> None:
@@ -678,12 +691,10 @@ def test_a_satellite_is_drawn_as_its_mesh() -> None:
         perception={"name": "model"},
         chaser={"mesh": "chaser_body"},
     )
-    scene = scene_of(flown)
-    corners = np.concatenate([face.corners_m for face in scene.target])
+    corners = np.concatenate([part.vertices_m for part, _ in target_body(flown).parts])
     np.testing.assert_allclose(
         [corners[:, 1].min(), corners[:, 1].max()], [-0.6387, 0.6393], atol=1e-3
     )
-    assert len(scene.chaser) > 100
     view = Viewpoint(np.zeros(3), 2.6, np.radians(-70.0), np.radians(35.0), 480, 400)
     pose = (np.zeros(3), rotations.IDENTITY)
     image = BodyRenderer(flown, (), view).render(view, pose, {}).bgr.astype(int)

@@ -303,6 +303,7 @@ def test_replay_runs_in_a_browser(tmp_path: Path) -> None:
     # Two charts of uPlot with the values at that time; the cursor of the other figures is there.
     charts = dom[dom.index('id="plot-docking"') : dom.index('id="figure-separation"')]
     assert charts.count("<canvas") == 2
+    assert ">0.20</td>" in charts
     assert ">1.000</td>" in charts
     assert re.search(r'class="panel"[^>]*><i style="left: 7[0-9.]*%;"', dom)
     assert re.search(r'<tr id="replay-row-1"><th[^>]*>chaser 1</th><td>–</td><td>2.000 m</td>', dom)  # noqa: RUF001

@@ -195,7 +195,7 @@
       toggle.textContent = zoomed ? "figure" : "zoom";
       if (zoomed) {
         open.set(name, new ZoomedFigure(charts, panels));
-        open.get(name).redraw();
+        queueMicrotask(() => open.get(name)?.redraw());  // uPlot has no scales before
         return;
       }
       open.get(name).charts.forEach((chart) => chart.destroy());

@@ -4,9 +4,10 @@
 The replay is our own canvas script (page/replay.js, 15 kB) because the export of viser 1.1
 (``StateSerializer.as_html``), although it opens offline from ``file://``, was measured to fit the
 report less well. For docking-contact (70 s at 10 Hz) it adds 1.2 MB, 0.8 MB of it the client; our
-data add 0.16 MB (camera images excluded). It needs WebAssembly and thus a page policy with
-``unsafe-eval``; with the policy of the report it does not start. It contains no GUI elements: no
-table and camera images that follow the time line, and no seeking from the list of events.
+data add 0.17 MB (camera images excluded), 0.05 MB of it the bodies. It needs WebAssembly and thus a
+page policy with ``unsafe-eval``; with the policy of the report it does not start. It contains no
+GUI elements: no table and camera images that follow the time line, and no seeking from the list of
+events.
 """
 
 from __future__ import annotations

@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 
 from chaserdock.analysis.dressed_bodies import Coat, DressedBody
 
+_EXPOSURE = 0.55
+"""Brightness of bodies, chosen: viser's lights together are brighter than white. Larger: paint in
+the light fades to white.
+"""
 _HIGHLIGHT = 0.3
 """Share of the highlight in the colour of a body, chosen: foil is golden. Larger: cells are
 grey."""
@@ -66,7 +70,7 @@ def _shown(coat: Coat) -> Array:
     mirrors is dark without its surroundings.
     """
     level = np.array(coat.rgb) + _HIGHLIGHT * np.array(coat.specular)
-    return 255.0 * np.clip(level, 0.0, 1.0)
+    return 255.0 * _EXPOSURE * np.clip(level, 0.0, 1.0)
 
 
 def polyline(points: Array) -> NDArray[np.float32]:

@@ -70,7 +70,7 @@
   const display = Array.from({ length: 1024 }, (_, k) => Math.round(255 * (k / 1023) ** data.gamma));
 
   class Raster {  // pixels with the inverse of their depth, twice as fine as the canvas: smooth edges
-    constructor() { this.canvas = document.createElement("canvas"); this.width = 0; }
+    constructor() { this.canvas = document.createElement("canvas"); this.width = this.top = this.low = 0; }
     begin(width, height) {
       if (this.width !== width || this.height !== height) {
         this.width = this.canvas.width = width; this.height = this.canvas.height = height;
@@ -79,7 +79,8 @@
         this.pixels = new Uint32Array(this.image.data.buffer);
         this.near = new Float32Array(width * height);
       }
-      this.pixels.fill(0); this.near.fill(0);
+      for (const buffer of [this.pixels, this.near]) buffer.fill(0, this.top * width, this.low * width);
+      this.top = height; this.low = 0;  // rows from and before which something is drawn
     }
     triangle(p, q, r, colour) {  // x, y and inverse of the depth of each corner
       const area = (q[0] - p[0]) * (r[1] - p[1]) - (r[0] - p[0]) * (q[1] - p[1]);
@@ -89,6 +90,7 @@
       const edges = [[p, q], [q, r], [r, p]].map(([a, b]) => [b[1] - a[1], a[0] - b[0], a[1] * b[0] - a[0] * b[1]]);
       const top = Math.max(0, Math.ceil(Math.min(p[1], q[1], r[1]) - 0.5));
       const low = Math.min(this.height - 1, Math.floor(Math.max(p[1], q[1], r[1]) - 0.5));
+      this.top = Math.min(this.top, top); this.low = Math.max(this.low, low + 1);
       for (let y = top; y <= low; y += 1) {
         let from = 0, to = this.width - 1;
         for (const [a, b, c] of edges) {
@@ -103,7 +105,12 @@
         }
       }
     }
-    end() { this.context.putImageData(this.image, 0, 0); return this.canvas; }
+    end(context, width, height) {  // draw on a canvas of this size
+      const rows = this.low - this.top, scale = height / this.height;
+      if (rows <= 0) return;
+      this.context.putImageData(this.image, 0, 0, 0, this.top, this.width, rows);
+      context.drawImage(this.canvas, 0, this.top, this.width, rows, 0, this.top * scale, width, rows * scale);
+    }
   }
   const raster = new Raster();
 
@@ -195,7 +202,7 @@
     }
     const poses = data.chasers.map((c) => pose(c, time));
     [target, ...poses].forEach((body, k) => add(body, shapes[k]));
-    context.drawImage(raster.end(), 0, 0, width, height);
+    raster.end(context, width, height);
 
     // Camera frustums, bright while the image is used.
     data.chasers.forEach((c, k) => {

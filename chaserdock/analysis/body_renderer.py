@@ -19,14 +19,9 @@ from chaserdock_world.rendering.mesh_renderer import MeshRenderer
 from chaserdock_world.rendering.scene_geometry import Obstacle
 from numpy.typing import NDArray
 
-from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint, tint
-from .film_bodies import DressedBody, chaser_body, target_body
+from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint
+from .dressed_bodies import AMBIENT, GAMMA, DressedBody, chaser_body, target_body
 
-AMBIENT = 0.22
-"""Share of ambient light: less than in the cameras' images, so that shadows are dark, but the
-shaded side is visible."""
-GAMMA = 0.6
-"""Exponent of the grey levels for display, as in snapshots."""
 _SEA = (2.6, 1.25, 0.55)
 """Colour (blue, green, red) of dark parts of the Earth relative to grey: the sea under air."""
 _CLOUD_LEVEL = 150.0
@@ -43,7 +38,7 @@ class BodyRenderer:
         # A cuboid of its own stands for each chaser's mesh.
         self._places = {i: (Box((1.0 + i, 1.0, 1.0)),) for i in chasers}
         target = target_body(scenario)
-        bodies = {i: chaser_body(scenario, i, reflectance(i)) for i in chasers}
+        bodies = {i: chaser_body(scenario, i) for i in chasers}
 
         def renderer(mesh_of: Callable[[DressedBody], TriangleMesh]) -> MeshRenderer:
             chosen = {self._places[i][0]: mesh_of(bodies[i]) for i in chasers}
@@ -84,12 +79,6 @@ def light_of(scenario: Scenario) -> Light:
     """Return the sun and the ambient light of films."""
     x, y, z = to_sun(scenario)
     return Light((x, y, z), 1.0 - AMBIENT, AMBIENT)
-
-
-def reflectance(chaser: int) -> tuple[float, float, float]:
-    """Return a chaser's colour as paint: red, green, blue, 0 to 1."""
-    blue, green, red = (0.85 * (tint(chaser) / 255.0) ** 1.6).tolist()
-    return red, green, blue
 
 
 def coloured_space(grey: NDArray[np.uint8]) -> BgrImage:

@@ -11,12 +11,11 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
+from .camera_frustum import CameraFrustum
+from .dressed_bodies import tint
 from .motion import Track
-from .plots import colour
-from .scene import Scene
 
 BgrImage = NDArray[np.uint8]
 BodyPose = tuple[Array, Array]
@@ -32,14 +31,6 @@ _TARGET_PATH = (150, 150, 150)
 _PLUME = np.array([255.0, 226.0, 190.0])
 _PLUME_SHARE = 0.3
 """Opacity of each of the four layers of a plume."""
-
-
-def tint(chaser: int) -> Array:
-    """Return a chaser's colour (3,), BGR, 0 to 255: that of the figures, lightened for the dark
-    background.
-    """
-    rgb = np.array(to_rgb(colour(chaser)))
-    return (255.0 * (0.78 * rgb + 0.22))[::-1]
 
 
 @dataclass(frozen=True)
@@ -154,7 +145,7 @@ def _lines(
 
 
 def draw(
-    scene: Scene,
+    frustum: CameraFrustum,
     view: Viewpoint,
     rendered: RenderedBodies,
     chasers: Mapping[int, BodyPose],
@@ -186,14 +177,14 @@ def draw(
     image[rendered.covered] = rendered.bgr[rendered.covered]
     for nozzle, end in before:
         _draw_plume(image, view, nozzle, end)
-    _draw_cameras(image, view, scene, chasers, cameras)
+    _draw_cameras(image, view, frustum, chasers, cameras)
     return image
 
 
 def _draw_cameras(
     image: BgrImage,
     view: Viewpoint,
-    scene: Scene,
+    frustum: CameraFrustum,
     chasers: Mapping[int, BodyPose],
     cameras: Mapping[int, bool],
 ) -> None:
@@ -202,8 +193,8 @@ def _draw_cameras(
         position, attitude = chasers[i]
         strength = 1.0 if used else 0.4
         bgr = (strength * tint(i)).tolist()
-        far = rotations.rotate(attitude, scene.camera_corners_m) + position
-        origin = rotations.rotate(attitude, scene.camera_origin_m) + position
+        far = rotations.rotate(attitude, frustum.corners_m) + position
+        origin = rotations.rotate(attitude, frustum.origin_m) + position
         for corner in far:
             _lines(image, view, np.stack([origin, corner]), bgr)
         _lines(image, view, far, bgr, closed=True)

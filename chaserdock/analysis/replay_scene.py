@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Data of the report's 3-D replay: the decimated flight, faces, and small camera images.
+"""Data of the report's 3-D replay: the decimated flight, bodies, and small camera images.
 
-The replay is our own canvas script (page/replay.js, 12 kB) because the export of viser 1.1
+The replay is our own canvas script (page/replay.js, 15 kB) because the export of viser 1.1
 (``StateSerializer.as_html``), although it opens offline from ``file://``, was measured to fit the
 report less well. For docking-contact (70 s at 10 Hz) it adds 1.2 MB, 0.8 MB of it the client; our
-data add 0.16 MB (camera images excluded). It needs WebAssembly and thus a page policy with
-``unsafe-eval``; with the policy of the report it does not start. It contains no GUI elements: no
-table and camera images that follow the time line, and no seeking from the list of events.
+data add 0.17 MB (camera images excluded), 0.05 MB of it the bodies. It needs WebAssembly and thus a
+page policy with ``unsafe-eval``; with the policy of the report it does not start. It contains no
+GUI elements: no table and camera images that follow the time line, and no seeking from the list of
+events.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ from chaserdock_protocol.recording.log import LogError
 from chaserdock_world.orbit import to_sun
 from numpy.typing import NDArray
 
+from .camera_frustum import camera_frustum
+from .charts import ArrayPool
 from .columns import nanoseconds, rows_since
+from .dressed_bodies import AMBIENT, GAMMA, DressedBody, chaser_body, target_body
 from .flight import RecordedFlight
 from .images import Pair, shots
 from .motion import TARGET, Track
-from .scene import Face, scene_of
 from .snapshot import annotated_image
 from .summary import tracking_errors
 from .time_series import Traces
@@ -43,22 +46,33 @@ _SHOT_WIDTH_PX = 256
 """Width (px) of the images in a report. Larger: sharper images, larger page."""
 
 
+_MOST_UNITS = 32_000
+"""Largest coordinate of a body in units, within 16 bits: units of 0.03 mm for a body of 1 m, a
+tenth of the distance between paint and surface.
+"""
+
+
 def _numbers(values: Array, digits: int) -> list[float]:
     # Adding 0.0 turns -0.0 into 0.0.
     return (np.round(np.asarray(values, dtype=float).ravel(), digits) + 0.0).tolist()
 
 
-def _faces(faces: tuple[Face, ...]) -> list[dict[str, Any]]:
-    return [
-        {
-            "c": _numbers(f.corners_m, 4),
-            "n": _numbers(f.normal, 4),
-            "g": f.grey,
-            "l": f.lift_m,
-            "d": [[_numbers(quad, 4), grey] for quad, grey in f.decals],
-        }
-        for f in faces
-    ]
+def _body(body: DressedBody, pool: ArrayPool) -> dict[str, Any]:
+    """Return the triangles of a body's coats: corners in ``unit_m`` as 16-bit integers."""
+    surfaces = body.surfaces()
+    unit_m = max(float(np.abs(soup.corners_m).max()) for soup in surfaces.values()) / _MOST_UNITS
+    return {
+        "unit_m": unit_m,
+        "coats": [
+            {
+                "rgb": coat.rgb,
+                "specular": coat.specular,
+                "exponent": coat.exponent,
+                "corners": pool.add(np.round(soup.corners_m / unit_m), "<i2"),
+            }
+            for coat, soup in surfaces.items()
+        ],
+    }
 
 
 def _rows_until_end(time_s: Array, at_s: Array) -> NDArray[np.intp]:
@@ -111,20 +125,22 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
             }
         )
 
-    scene = scene_of(flight.scenario)
+    pool, frustum = ArrayPool(), camera_frustum(flight.scenario)
+    target_shape = _body(target_body(flight.scenario), pool)
+    for chaser in chasers:
+        chaser["body"] = _body(chaser_body(flight.scenario, chaser["id"]), pool)
     return {
         "times": _numbers(target.time_s[rows], 3),
         "motion": flight.motion.describe().capitalize(),
         "reach_m": reach_m,
         "sun": list(to_sun(flight.scenario)),
-        "target": _thinned(target, rows),
+        "ambient": AMBIENT,
+        "gamma": GAMMA,
+        "target": _thinned(target, rows) | {"body": target_shape},
         "chasers": chasers,
-        "scene": {
-            "target": _faces(scene.target),
-            "chaser": _faces(scene.chaser),
-            "camera_origin": _numbers(scene.camera_origin_m, 4),
-            "camera_corners": _numbers(scene.camera_corners_m, 4),
-        },
+        "camera_origin": _numbers(frustum.origin_m, 4),
+        "camera_corners": _numbers(frustum.corners_m, 4),
+        "arrays": pool.arrays,
         "images": images,
     }
 

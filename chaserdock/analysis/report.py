@@ -132,7 +132,7 @@ def _chart_script(charts: ChartData) -> str:
     library = _page_file("uPlot.iife.min.js").partition("\n")[2]  # without the address of its site
     licence, style = _page_file("uPlot.LICENSE.txt"), _page_file("uPlot.min.css")
     code = f"/*! uPlot 1.6.32\n{licence}*/\n{library}\n{_page_file('charts.js')}"
-    data = {"arrays": charts.arrays, "figures": charts.figures}
+    data = {"arrays": charts.pool.arrays, "figures": charts.figures}
     return f"<style>{style}</style>\n{_script('chart-data', data, code)}"
 
 

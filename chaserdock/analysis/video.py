@@ -27,6 +27,7 @@ from chaserdock.criterion import table_rows
 from chaserdock.verdict import Verdict, verdict_of
 
 from .body_renderer import BodyRenderer
+from .camera_frustum import camera_frustum
 from .chase_camera import (
     BgrImage,
     RenderedBodies,
@@ -40,7 +41,6 @@ from .chase_path import ChasePath, FilmClock, approaches
 from .flight import RecordedFlight, load_flight
 from .images import Pair, columns_for, latest_images, pairs
 from .motion import TARGET, Track
-from .scene import scene_of
 from .snapshot import annotated_image
 from .summary import summary_of_run, tracking_errors
 from .time_series import ActuatorHistory, load_traces
@@ -244,7 +244,7 @@ class Film:
         self.flight, self.bodies = flight, cast(Bodies, FastBodies(flight.scenario))
         self._log, self._plumes, self._verdict, self._fps = log, plumes, verdict, fps
         self.size, self._part_s, self._speed = size, part_s, speed
-        self._scene = scene_of(flight.scenario)
+        self._frustum = camera_frustum(flight.scenario)
         self.numbers = flight.shown
         self._target = flight.motion[TARGET]
         self._chasers = {i: flight.motion[f"chaser/{i}"] for i in self.numbers}
@@ -322,7 +322,7 @@ class Film:
         }
         plumes = {i: self._plumes_at(i, time_s) for i in shot.chasers if i in self._plumes}
         image = draw(
-            self._scene,
+            self._frustum,
             shot.look,
             self.bodies.render(shot),
             shot.chasers,
@@ -333,7 +333,9 @@ class Film:
         close = self._close_look(time_s)
         if close is not None and focus is not None:
             near = self._shot(f"{number:05d}-close", close, time_s)
-            view = draw(self._scene, close, self.bodies.render(near), near.chasers, {}, {}, plumes)
+            view = draw(
+                self._frustum, close, self.bodies.render(near), near.chasers, {}, {}, plumes
+            )
             _put_inset(image, self.layout.close_up, view, tint(focus.chaser).tolist())
         self._write(image, film_s, time_s)
         return image

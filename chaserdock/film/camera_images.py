@@ -25,11 +25,11 @@ from chaserdock_world.rendering.scene_geometry import Obstacle
 from chaserdock_world.rendering.textures import BLACK, WHITE
 from numpy.typing import ArrayLike, NDArray
 
-from chaserdock.analysis.film_bodies import Coat, DressedBody, add_markers, grey_coat
+from chaserdock.analysis.dressed_bodies import Coat, DressedBody, add_markers, grey_coat
 
 from .path_tracer import PathTracer, Surfaces, fastest_variant, require_mitsuba, surfaces
 
-_PRINT = {242: Coat((WHITE, WHITE, WHITE)), 13: Coat((BLACK, BLACK, BLACK))}
+_PAPER, _INK = Coat((WHITE, WHITE, WHITE)), Coat((BLACK, BLACK, BLACK))
 """Coats of markers: reflectances of the fast renderers' prints."""
 _PRINT_LIFT_M = 1e-4
 """Distance, m, between the layers of a print: a hundred times the resolution of the tracer's
@@ -104,7 +104,7 @@ def _true_body(scenario: Scenario) -> DressedBody:
     shape = mesh_of_boxes(model.boxes) if mesh is None else with_markers(mesh, model)
     body = DressedBody([(part, grey_coat(part.material)) for part in shape.parts])
     if mesh is None:
-        add_markers(body, model, _PRINT, _PRINT_LIFT_M)
+        add_markers(body, model, _PAPER, _INK, _PRINT_LIFT_M)
     return body
 
 

@@ -19,9 +19,9 @@ from chaserdock_world.orbit import earth_disc
 from chaserdock_world.rendering.background import Background, Earth
 from numpy.typing import NDArray
 
-from chaserdock.analysis.body_renderer import GAMMA, coloured_space, light_of, reflectance, shown
+from chaserdock.analysis.body_renderer import coloured_space, light_of, shown
 from chaserdock.analysis.chase_camera import BgrImage, RenderedBodies, Shot, Viewpoint
-from chaserdock.analysis.film_bodies import DressedBody, chaser_body, target_body
+from chaserdock.analysis.dressed_bodies import GAMMA, DressedBody, chaser_body, target_body
 from chaserdock.images import write_image
 
 from .path_tracer import PathTracer, fastest_variant, require_mitsuba, surfaces
@@ -146,7 +146,7 @@ def _draw(
 
 def _bodies(scenario: Scenario, chasers: Sequence[int]) -> list[DressedBody]:
     """Return the target and chasers."""
-    return [target_body(scenario), *(chaser_body(scenario, i, reflectance(i)) for i in chasers)]
+    return [target_body(scenario), *(chaser_body(scenario, i) for i in chasers)]
 
 
 def _displayed(image: NDArray[np.float32]) -> NDArray[np.uint8]:

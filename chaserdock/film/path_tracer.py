@@ -21,7 +21,6 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.meshes import TriangleMesh, triangle_soup
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
@@ -29,9 +28,14 @@ from chaserdock_world.rendering.background import WHITE_LEVEL, Earth, Light
 from chaserdock_world.rendering.scene_geometry import NEAR_M
 from numpy.typing import NDArray
 
-from chaserdock.analysis.body_renderer import light_of, reflectance
+from chaserdock.analysis.body_renderer import light_of
 from chaserdock.analysis.chase_camera import BodyPose, Viewpoint
-from chaserdock.analysis.film_bodies import Coat, DressedBody, chaser_body, target_body
+from chaserdock.analysis.dressed_bodies import (
+    Coat,
+    DressedBody,
+    chaser_body,
+    target_body,
+)
 
 _COMPILED, _PLAIN = "llvm_ad_rgb", "scalar_rgb"
 _DEPTH = 4
@@ -77,7 +81,7 @@ def _try_compiled() -> None:
     """Render a small picture of all coats with the compiled variant."""
     scenario = load_scenario(find_scenario("demo"))
     tracer, look = PathTracer(1, _COMPILED), Viewpoint(np.zeros(3), 3.0, 0.5, 0.5, 16, 16)
-    bodies = (target_body(scenario), chaser_body(scenario, 0, reflectance(0)))
+    bodies = (target_body(scenario), chaser_body(scenario, 0))
     placed = [
         (surfaces(body), (np.array([x, 0.0, 0.0]), rotations.IDENTITY))
         for body, x in zip(bodies, (0.0, 0.8), strict=True)
@@ -262,9 +266,7 @@ def _rgb(values: Any) -> dict[str, Any]:
 def surfaces(body: DressedBody) -> Surfaces:
     """Return the surfaces of a body, in its axes."""
     out = {}
-    for coat in dict.fromkeys(c for _, c in body.parts):
-        mesh = TriangleMesh("coat", tuple(p for p, c in body.parts if c == coat), {})
-        soup = triangle_soup(mesh)
+    for coat, soup in body.surfaces().items():
         corners, normals = soup.corners_m.reshape(-1, 3), soup.normals.reshape(-1, 3)
         # Seen along the axis that the triangle faces most.
         first, second, third = np.moveaxis(soup.corners_m, 1, 0)

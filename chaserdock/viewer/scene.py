@@ -16,7 +16,7 @@ from chaserdock_protocol.scenario import FlightScenario, Scenario
 from chaserdock_world.orbit import earth_disc, to_sun
 from chaserdock_world.rendering.background import star_field
 
-from chaserdock.analysis.scene import scene_of
+from chaserdock.analysis.dressed_bodies import chaser_body, target_body
 
 from . import shapes
 from .history import History
@@ -81,8 +81,7 @@ class SceneView:
         self._add_space()
         self._add_scale()
 
-        bodies = scene_of(scenario)
-        self._target = self._body("/scene/target", shapes.mesh_of(bodies.target))
+        self._target = self._body("/scene/target", shapes.mesh_of(target_body(scenario)))
         self._estimate = scene.add_frame("/scene/estimate", axes_length=0.15, axes_radius=0.002)
         size = scenario.target_model().size_m
         self._lines(
@@ -107,7 +106,7 @@ class SceneView:
         for i in range(len(scenario.chasers)):
             colour = _rgb(COLOURS[i % len(COLOURS)])
             name = f"/scene/chaser_{i}"
-            self._chasers.append(self._body(name, shapes.mesh_of(bodies.chaser, colour)))
+            self._chasers.append(self._body(name, shapes.mesh_of(chaser_body(scenario, i))))
             scene.add_label(
                 f"{name}/name", str(i), position=(0.0, 0.0, 0.75 * scenario.chaser.size_m[2])
             )
@@ -191,6 +190,7 @@ class SceneView:
         solid = trimesh.Trimesh(
             mesh.vertices_m,
             mesh.triangles,
+            vertex_normals=mesh.normals,
             vertex_colors=mesh.colours,
             process=False,
             validate=False,

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -14,12 +13,15 @@ from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import NDArray
 
-from chaserdock.analysis.scene import Face
+from chaserdock.analysis.dressed_bodies import Coat, DressedBody
 
-_LAYER_M = 0.0004
-"""Offset (m) of each painted layer above its face. Larger: layers visibly float; smaller: the depth
-buffer does not separate them.
+_EXPOSURE = 0.55
+"""Brightness of bodies, chosen: viser's lights together are brighter than white. Larger: paint in
+the light fades to white.
 """
+_HIGHLIGHT = 0.3
+"""Share of the highlight in the colour of a body, chosen: foil is golden. Larger: cells are
+grey."""
 _NEAREST_EARTH_M = 50.0
 """Distance (m) of the drawn Earth's surface, in its true angular size. Larger: less parallax when
 the view is moved; smaller than the scene: chasers would fly through it.
@@ -39,44 +41,36 @@ radius.
 @dataclass(frozen=True)
 class Mesh:
     """Coloured triangles. ``vertices_m`` (V, 3). ``triangles`` (F, 3): indices of their corners.
-    ``colours`` (V, 3): of the vertices, 0 to 255.
+    ``colours`` (V, 3): of the vertices, 0 to 255. ``normals`` (V, 3): those of the triangles
+    without.
     """
 
     vertices_m: Array
     triangles: NDArray[np.int32]
     colours: NDArray[np.uint8]
+    normals: Array | None = None
 
 
-def mesh_of(faces: Iterable[Face], tint: tuple[int, int, int] | None = None) -> Mesh:
-    """Return faces with their decals as a mesh in body axes. ``tint``: colour of the faces, not of
-    the decals.
+def mesh_of(body: DressedBody) -> Mesh:
+    """Return a dressed body as a mesh in body axes. Its coats are as in sunlight; corners are not
+    shared, so that they have the normals of their triangles.
     """
-    corners: list[Array] = []
-    normals: list[Array] = []
-    colours: list[Array] = []
-    for face in faces:
-        colour = np.full(3, float(face.grey))
-        if tint is not None:
-            colour = 0.35 * colour + 0.65 * np.array(tint)
-        corners.append(face.corners_m)
-        normals += [face.normal] * (1 + len(face.decals))
-        colours.append(np.tile(colour, (4, 1)))
-        for layer, (painted, grey) in enumerate(face.decals):
-            # Layers of a marker: border, black square, white cells.
-            corners.append(painted + face.normal * _LAYER_M * (1 + min(layer, 2)))
-            colours.append(np.full((4, 3), float(grey)))
-    # Vertices are not shared, so that each quadrangle is flat shaded. Corners are counterclockwise
-    # seen from outside.
-    quads = np.array([_counterclockwise(c, n) for c, n in zip(corners, normals, strict=True)])
-    halves = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
-    triangles = (4 * np.arange(len(quads), dtype=np.int32)[:, None, None] + halves).reshape(-1, 3)
-    return Mesh(quads.reshape(-1, 3), triangles, np.concatenate(colours).astype(np.uint8))
+    surfaces = body.surfaces()
+    corners = np.concatenate([soup.corners_m.reshape(-1, 3) for soup in surfaces.values()])
+    normals = np.concatenate([soup.normals.reshape(-1, 3) for soup in surfaces.values()])
+    colours = np.concatenate(
+        [np.tile(_shown(coat), (3 * len(soup.part), 1)) for coat, soup in surfaces.items()]
+    )
+    triangles = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+    return Mesh(corners, triangles, colours.astype(np.uint8), normals)
 
 
-def _counterclockwise(corners: Array, normal: Array) -> Array:
-    """Return the corners (4, 3) counterclockwise about ``normal`` (3,)."""
-    turned = np.cross(corners[1] - corners[0], corners[2] - corners[0]) @ normal
-    return corners if turned > 0.0 else corners[::-1]
+def _shown(coat: Coat) -> Array:
+    """Return the colour (3,), 0 to 255, linear, of a coat with a part of its highlight: what
+    mirrors is dark without its surroundings.
+    """
+    level = np.array(coat.rgb) + _HIGHLIGHT * np.array(coat.specular)
+    return 255.0 * _EXPOSURE * np.clip(level, 0.0, 1.0)
 
 
 def polyline(points: Array) -> NDArray[np.float32]:

@@ -11,8 +11,8 @@ from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from chaserdock.analysis.body_renderer import BodyRenderer, coloured_space
-from chaserdock.analysis.chase_camera import Viewpoint, tint
-from chaserdock.analysis.film_bodies import WHITE, chaser_body, target_body
+from chaserdock.analysis.chase_camera import Viewpoint
+from chaserdock.analysis.dressed_bodies import WHITE, chaser_body, target_body, tint
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 AT_REST = (np.zeros(3), rotations.IDENTITY)
@@ -47,7 +47,7 @@ def test_a_chaser_is_dressed_within_its_stated_size(name: str) -> None:
     scenario = load_scenario(find_scenario(name))
     own = scenario.chaser
     half = np.array(own.size_m) / 2.0 + 1.3e-3  # with paint on faces
-    body = chaser_body(scenario, 3, (0.5, 0.2, 0.2))
+    body = chaser_body(scenario, 3)
     for part, _ in body.parts:
         if part.name in ("strut", "hub", "nozzle"):
             reach = np.max(np.abs([t.position_m for t in own.thrusters]), axis=0) + 0.02
@@ -70,7 +70,7 @@ def test_numbers_are_painted_and_differ() -> None:
     scenario = load_scenario(find_scenario("demo"))
 
     def painted(number: int) -> Array:
-        body = chaser_body(scenario, number, (0.5, 0.2, 0.2))
+        body = chaser_body(scenario, number)
         return np.concatenate([p.vertices_m for p, coat in body.parts if coat is WHITE])
 
     assert len(painted(0)) > 100

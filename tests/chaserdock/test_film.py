@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from chaserdock.analysis.dressed_bodies import Coat
 from chaserdock_models import rotations
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.scenario import load_scenario
@@ -18,7 +19,6 @@ from chaserdock_world.rendering.background import Light
 from numpy.typing import NDArray
 
 from chaserdock.analysis.chase_camera import Shot, Viewpoint
-from chaserdock.analysis.film_bodies import Coat
 from chaserdock.analysis.video import FastBodies
 from chaserdock.cli.main import app
 from chaserdock.datasets.views import ViewLimits, ViewRenderer
@@ -125,7 +125,8 @@ def test_images_of_a_dataset_have_the_outline_of_the_labels(
     """All of the outline within a pixel, and the mask as a whole within a tenth of one."""
     white = Coat((1.0, 1.0, 1.0))
     monkeypatch.setattr(camera_images, "grey_coat", lambda material: white)
-    monkeypatch.setattr(camera_images, "_PRINT", {242: white, 13: white})
+    monkeypatch.setattr(camera_images, "_PAPER", white)
+    monkeypatch.setattr(camera_images, "_INK", white)
     sets = ('navigation.grade="exact"', CAMERA, "camera.effects.point_spread_px=0.0")
     name, range_m = TARGETS[target]
     scenario = load_scenario(find_scenario(name), sets)

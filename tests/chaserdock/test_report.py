@@ -42,9 +42,11 @@ from chaserdock.analysis.approach import approach_of
 from chaserdock.analysis.body_renderer import BodyRenderer
 from chaserdock.analysis.charts import ChartData
 from chaserdock.analysis.chase_camera import Viewpoint
+from chaserdock.analysis.dressed_bodies import chaser_body, target_body
 from chaserdock.analysis.figures import (
     FIGURES,
     _FewTicks,
+    approach,
     cameras,
     consistency_text,
     docking,
@@ -59,7 +61,6 @@ from chaserdock.analysis.flight import RecordedFlight, ReferenceHistory, load_fl
 from chaserdock.analysis.images import columns_for, pairs, shots
 from chaserdock.analysis.plots import AXES_XYZ, SERIES, MissingData, new_figure, save
 from chaserdock.analysis.report import _chasers, report_of, table, write_report
-from chaserdock.analysis.scene import scene_of
 from chaserdock.analysis.summary import summary_of, text_of, tracking_components, tracking_errors
 from chaserdock.analysis.time_series import (
     OUTCOMES,
@@ -217,6 +218,19 @@ def test_replay_data_equal_the_recorded_motion(short_flight: Path, page: Page) -
         assert all(url.startswith("data:image/jpeg;base64,") for url in urls)
 
 
+def test_replay_draws_the_bodies_of_the_film(short_flight: Path, page: Page) -> None:
+    data, flown = json.loads(page.data), load_flight(short_flight / "mission.mcap").scenario
+    shown = [(data["target"]["body"], target_body(flown))]
+    shown += [(data["chasers"][i]["body"], chaser_body(flown, i)) for i in (0, 1)]
+    for stored, body in shown:
+        found = zip(stored["coats"], body.surfaces().items(), strict=True)
+        for k, (coat, soup) in found:
+            assert k["rgb"] == list(coat.rgb)
+            units = np.frombuffer(base64.b64decode(data["arrays"][k["corners"]]), dtype="<i2")
+            corners = stored["unit_m"] * units.reshape(-1, 3, 3)
+            np.testing.assert_allclose(corners, soup.corners_m, atol=4e-5)
+
+
 def test_every_figure_is_described() -> None:
     text = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
     assert [k.name for k in FIGURES if f"`{k.name}`" not in text] == []
@@ -289,6 +303,7 @@ def test_replay_runs_in_a_browser(tmp_path: Path) -> None:
     # Two charts of uPlot with the values at that time; the cursor of the other figures is there.
     charts = dom[dom.index('id="plot-docking"') : dom.index('id="figure-separation"')]
     assert charts.count("<canvas") == 2
+    assert ">0.20</td>" in charts
     assert ">1.000</td>" in charts
     assert re.search(r'class="panel"[^>]*><i style="left: 7[0-9.]*%;"', dom)
     assert re.search(r'<tr id="replay-row-1"><th[^>]*>chaser 1</th><td>–</td><td>2.000 m</td>', dom)  # noqa: RUF001
@@ -390,12 +405,35 @@ def test_charts_have_the_values_of_the_figures(tmp_path: Path) -> None:
     curve = panel["curves"][-1]
     assert curve["colour"] == "--series-1"
     x, y = (
-        np.frombuffer(base64.b64decode(charts.arrays[curve[k]]), dtype="<f4") for k in ("x", "y")
+        np.frombuffer(base64.b64decode(charts.pool.arrays[curve[k]]), dtype="<f4")
+        for k in ("x", "y")
     )
     time_s, distance_m = flight.motion["chaser/1"].distance_to(flight.motion["target"])
     np.testing.assert_allclose(x, time_s, rtol=1e-6)
     np.testing.assert_allclose(y, distance_m, rtol=1e-6)
-    assert panel["x"] == [0.0, pytest.approx(20.0)]
+    assert panel["x"]["ends"] == [0.0, pytest.approx(20.0)]
+
+
+def test_charts_are_of_any_x_axis_and_have_bars(tmp_path: Path) -> None:
+    """Over a range that runs to the right in time, and with an image's outcome in each row."""
+    flight = with_references(
+        tmp_path / "a.mcap", "docking-contact", [(0.0, "hold"), (1.0, "final")]
+    )
+    charts, traces = ChartData(), load_traces(tmp_path / "a.mcap", flight.scenario)
+    for name, draw in (("approach", approach), ("cameras", cameras)):
+        figure = draw(flight, traces)
+        figure.draw_without_rendering()
+        charts.add(name, figure)
+    lateral, closing = charts.figures["approach"]
+    assert lateral["over"] == closing["over"] == "range / mm"
+    assert (lateral["x"]["direction"], lateral["time"]) == (-1, False)
+    assert [limit["x"] for limit in lateral["limits"]][-1] == [0.0, 0.0]  # at contact
+    top, _ = charts.figures["cameras"]
+    assert top["time"]
+    assert top["y"]["names"] == [(0.0, "chaser 0")]
+    (bar,) = top["bars"]
+    assert bar["y"] == pytest.approx([-0.36, 0.36])
+    assert bar["colour"] == "--grid"  # nothing seen
 
 
 def test_approach_is_measured_from_the_port(tmp_path: Path) -> None:
@@ -654,12 +692,10 @@ def test_a_satellite_is_drawn_as_its_mesh() -> None:
         perception={"name": "model"},
         chaser={"mesh": "chaser_body"},
     )
-    scene = scene_of(flown)
-    corners = np.concatenate([face.corners_m for face in scene.target])
+    corners = np.concatenate([part.vertices_m for part, _ in target_body(flown).parts])
     np.testing.assert_allclose(
         [corners[:, 1].min(), corners[:, 1].max()], [-0.6387, 0.6393], atol=1e-3
     )
-    assert len(scene.chaser) > 100
     view = Viewpoint(np.zeros(3), 2.6, np.radians(-70.0), np.radians(35.0), 480, 400)
     pose = (np.zeros(3), rotations.IDENTITY)
     image = BodyRenderer(flown, (), view).render(view, pose, {}).bgr.astype(int)

@@ -40,6 +40,7 @@ from hypothesis import strategies as st
 from mission_keys import client, make_keys, router_with_rights
 from websockets.frames import Frame, Opcode
 
+from chaserdock.analysis.dressed_bodies import chaser_body, target_body
 from chaserdock.cli.run import announce_viewer
 from chaserdock.launch.launcher import free_port as unused_port
 from chaserdock.viewer import plots, shapes
@@ -402,17 +403,18 @@ def test_time_line_plays_to_its_end_and_follows_the_slider() -> None:
 
 @pytest.mark.parametrize("name", ["four-chaser-docking", "docking-contact"])
 def test_mesh_normals_point_outwards(name: str) -> None:
-    from chaserdock.analysis.scene import scene_of
-
+    """And chasers have colours of their own, those of the film."""
     scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml")
-    faces = scene_of(scenario).target
-    mesh = shapes.mesh_of(faces)
-    assert mesh.triangles.max() == len(mesh.vertices_m) - 1
-    a, b, c = (mesh.vertices_m[mesh.triangles[:, k]] for k in range(3))
-    normals = np.cross(b - a, c - a)
-    assert np.all(np.linalg.norm(normals, axis=1) > 0.0)
-    quads = [face.normal for face in faces for _ in range(1 + len(face.decals))]
-    assert np.all(np.einsum("ij,ij->i", normals, np.repeat(quads, 2, axis=0)) > 0.0)
+    one, two = (shapes.mesh_of(chaser_body(scenario, i)) for i in (0, 1))
+    assert {tuple(c) for c in one.colours.tolist()} != {tuple(c) for c in two.colours.tolist()}
+    for mesh in (one, shapes.mesh_of(target_body(scenario))):
+        assert mesh.triangles.max() == len(mesh.vertices_m) - 1
+        a, b, c = (mesh.vertices_m[mesh.triangles[:, k]] for k in range(3))
+        normals = np.cross(b - a, c - a)
+        assert np.all(np.linalg.norm(normals, axis=1) > 0.0)
+        assert mesh.normals is not None
+        corners = mesh.normals[mesh.triangles]
+        assert np.all(np.einsum("ij,ikj->ik", normals, corners) > 0.0)
 
 
 def test_scale_is_a_round_number_within_the_scene() -> None:

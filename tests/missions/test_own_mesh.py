@@ -13,7 +13,7 @@ from chaserdock_models.satellites import satellite
 from harness import run, summary
 
 from chaserdock import open_log
-from chaserdock.analysis.scene import scene_of
+from chaserdock.analysis.dressed_bodies import target_body
 from chaserdock.targets.mesh_writer import write_mesh
 
 
@@ -35,7 +35,7 @@ def test_own_mesh_is_acquired_by_a_single_chaser_and_drawn(tmp_path: Path) -> No
     )
     log = open_log(tmp_path / "run")
     assert list(log.messages("controller/target"))[-1].status == "tracking"
-    shape = np.concatenate([face.corners_m for face in scene_of(log.scenario).target])
+    shape = np.concatenate([p.vertices_m for p, _ in target_body(log.scenario).parts])
     np.testing.assert_allclose(
         shape.max(axis=0), satellite("geo_servicer").bounds_m()[1], atol=0.005
     )

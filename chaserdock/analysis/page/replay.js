@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-// 3-D replay: flat faces on a 2-D canvas in order of depth (painter's algorithm), without library or request.
+// 3-D replay: triangles with a depth buffer on a 2-D canvas, without library, request or graphics processor.
 (function () {
   "use strict";
   const data = JSON.parse(document.getElementById("replay-data").textContent);
@@ -51,8 +51,70 @@
     return last;
   }
 
+  // Bodies: for each triangle its corners (9 numbers, m), its normal and its coat.
+  function shape(body) {
+    const corners = [], normals = [], coats = [];
+    for (const coat of body.coats) {
+      const bytes = Uint8Array.from(atob(data.arrays[coat.corners]), (c) => c.charCodeAt(0));
+      const own = Array.from(new Int16Array(bytes.buffer), (v) => v * body.unit_m);
+      for (let k = 0; k < own.length; k += 9) {
+        const c = own.slice(k, k + 9);
+        const a = [c[3] - c[0], c[4] - c[1], c[5] - c[2]], b = [c[6] - c[0], c[7] - c[1], c[8] - c[2]];
+        corners.push(...c); coats.push(coat);
+        normals.push(unit([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]));
+      }
+    }
+    return { corners, normals, coats };
+  }
+  const shapes = [data.target, ...data.chasers].map((b) => shape(b.body));
+  const display = Array.from({ length: 1024 }, (_, k) => Math.round(255 * (k / 1023) ** data.gamma));
+
+  class Raster {  // pixels with the inverse of their depth, twice as fine as the canvas: smooth edges
+    constructor() { this.canvas = document.createElement("canvas"); this.width = this.top = this.low = 0; }
+    begin(width, height) {
+      if (this.width !== width || this.height !== height) {
+        this.width = this.canvas.width = width; this.height = this.canvas.height = height;
+        this.context = this.canvas.getContext("2d");
+        this.image = new ImageData(width, height);
+        this.pixels = new Uint32Array(this.image.data.buffer);
+        this.near = new Float32Array(width * height);
+      }
+      for (const buffer of [this.pixels, this.near]) buffer.fill(0, this.top * width, this.low * width);
+      this.top = height; this.low = 0;  // rows from and before which something is drawn
+    }
+    triangle(p, q, r, colour) {  // x, y and inverse of the depth of each corner
+      const area = (q[0] - p[0]) * (r[1] - p[1]) - (r[0] - p[0]) * (q[1] - p[1]);
+      if (area >= 0) return;  // seen from behind: y points down
+      const dx = ((q[2] - p[2]) * (r[1] - p[1]) - (r[2] - p[2]) * (q[1] - p[1])) / area;
+      const dy = ((r[2] - p[2]) * (q[0] - p[0]) - (q[2] - p[2]) * (r[0] - p[0])) / area;
+      const edges = [[p, q], [q, r], [r, p]].map(([a, b]) => [b[1] - a[1], a[0] - b[0], a[1] * b[0] - a[0] * b[1]]);
+      const top = Math.max(0, Math.ceil(Math.min(p[1], q[1], r[1]) - 0.5));
+      const low = Math.min(this.height - 1, Math.floor(Math.max(p[1], q[1], r[1]) - 0.5));
+      this.top = Math.min(this.top, top); this.low = Math.max(this.low, low + 1);
+      for (let y = top; y <= low; y += 1) {
+        let from = 0, to = this.width - 1;
+        for (const [a, b, c] of edges) {
+          const rest = b * (y + 0.5) + c;
+          if (a > 0) from = Math.max(from, Math.ceil(-rest / a - 0.5));
+          else if (a < 0) to = Math.min(to, Math.floor(-rest / a - 0.5));
+          else if (rest < 0) to = -1;
+        }
+        let near = p[2] + dx * (from + 0.5 - p[0]) + dy * (y + 0.5 - p[1]);
+        for (let k = y * this.width + from; k <= y * this.width + to; k += 1, near += dx) {
+          if (near > this.near[k]) { this.near[k] = near; this.pixels[k] = colour; }
+        }
+      }
+    }
+    end(context, width, height) {  // draw on a canvas of this size
+      const rows = this.low - this.top, scale = height / this.height;
+      if (rows <= 0) return;
+      this.context.putImageData(this.image, 0, 0, 0, this.top, this.width, rows);
+      context.drawImage(this.canvas, 0, this.top, this.width, rows, 0, this.top * scale, width, rows * scale);
+    }
+  }
+  const raster = new Raster();
+
   function css(name) { return getComputedStyle(document.documentElement).getPropertyValue(name).trim(); }
-  function rgb(hex) { return [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16)); }
 
   function draw() {
     const ratio = window.devicePixelRatio || 1;
@@ -85,13 +147,6 @@
       }
       context.stroke(); context.setLineDash([]);
     }
-    function polygon(points, colour) {
-      if (points.some((p) => p[2] < 0.02)) return;
-      context.fillStyle = colour; context.strokeStyle = colour; context.lineWidth = 0.5;
-      context.beginPath();
-      points.forEach((p, k) => (k ? context.lineTo(p[0], p[1]) : context.moveTo(p[0], p[1])));
-      context.closePath(); context.fill(); context.stroke();
-    }
 
     // Paths: past strong, future faint. In the target frame they are relative to the target.
     const now = place(time)[0];
@@ -115,39 +170,45 @@
     if (!ride.checked) path(data.target, css("--faint"));
     data.chasers.forEach((c) => path(c, css("--series-" + (c.id % 8))));
 
-    const faces = [];
-    function add(body, list, tint) {
-      for (const face of list) {
-        const normal = apply(body.m, face.n);
-        const corners = [0, 3, 6, 9].map((k) => sum(apply(body.m, face.c.slice(k, k + 3)), body.p));
-        const middle = corners.reduce(sum, [0, 0, 0]).map((v) => v / 4);
-        const from = apply(turn, minus(middle, centre));
-        const toEye = [eye[0] * reach - from[0], eye[1] * reach - from[1], eye[2] * reach - from[2]];
-        if (dot(apply(turn, normal), toEye) <= 0) continue;
-        const lit = 0.5 + 0.5 * Math.max(0, dot(normal, light));
-        faces.push({ depth: Math.hypot(...toEye) - face.l, body, face, corners, lit, tint });
-      }
+    const fine = Math.max(2, ratio), toEye = apply(transposed(turn), eye), half = unit(sum(light, toEye));
+    raster.begin(Math.round(fine * width), Math.round(fine * height));
+    function lit(coat, normal) {  // colour as a pixel: sun, ambient light and Blinn's highlight
+      const sun = (1 - data.ambient) * Math.max(0, dot(normal, light));
+      const shine = sun > 0 ? (1 - data.ambient) * Math.max(0, dot(normal, half)) ** coat.exponent : 0;
+      const [r, g, b] = coat.rgb.map((v, k) => {
+        const level = v * (data.ambient + sun) + coat.specular[k] * shine;
+        return display[Math.round(1023 * Math.min(1, level))];
+      });
+      return (255 << 24 | b << 16 | g << 8 | r) >>> 0;
+    }
+    function add(body, own) {
+      const { corners, normals, coats } = own, back = transposed(body.m);
+      const view = [right, up, eye].map((axis) => apply(back, apply(transposed(turn), axis)));  // in body axes
+      const shift = apply(turn, minus(body.p, centre));
+      const [across, along, towards] = [right, up, eye].map((axis) => dot(axis, shift));
+      const viewer = apply(back, sum(toEye.map((v) => v * reach), minus(centre, body.p)));
+      const pixel = (k) => {
+        const c = [corners[k], corners[k + 1], corners[k + 2]], depth = reach - towards - dot(view[2], c);
+        if (depth < 0.02) return null;
+        const scale = fine * focal / depth;
+        return [fine * width / 2 + scale * (across + dot(view[0], c)), fine * height / 2 - scale * (along + dot(view[1], c)), 1 / depth];
+      };
+      coats.forEach((coat, k) => {
+        const n = normals[k], first = 9 * k;
+        if (dot(n, viewer) <= n[0] * corners[first] + n[1] * corners[first + 1] + n[2] * corners[first + 2]) return;
+        const p = pixel(first), q = pixel(first + 3), r = pixel(first + 6);
+        if (p && q && r) raster.triangle(p, q, r, lit(coat, apply(body.m, n)));
+      });
     }
     const poses = data.chasers.map((c) => pose(c, time));
-    add(target, data.scene.target, null);
-    data.chasers.forEach((c, k) => add(poses[k], data.scene.chaser, rgb(css("--series-" + (c.id % 8)))));
-    faces.sort((a, b) => b.depth - a.depth);
-    function shade(grey, lit, tint) {
-      const g = grey * lit;
-      return tint ? `rgb(${tint.map((v) => Math.round(Math.min(255, v * (0.3 + 0.75 * lit * grey / 110) + 18))).join()})` : `rgb(${g},${g},${g})`;
-    }
-    for (const f of faces) {
-      polygon(f.corners.map(see), shade(f.face.g, f.lit, f.tint));
-      for (const [quad, grey] of f.face.d) {
-        polygon([0, 3, 6, 9].map((k) => see(sum(apply(f.body.m, quad.slice(k, k + 3)), f.body.p))), shade(grey, f.lit, null));
-      }
-    }
+    [target, ...poses].forEach((body, k) => add(body, shapes[k]));
+    raster.end(context, width, height);
 
     // Camera frustums, bright while the image is used.
     data.chasers.forEach((c, k) => {
       const colour = css("--series-" + (c.id % 8));
-      const origin = see(sum(apply(poses[k].m, data.scene.camera_origin), poses[k].p));
-      const far = [0, 3, 6, 9].map((n) => see(sum(apply(poses[k].m, data.scene.camera_corners.slice(n, n + 3)), poses[k].p)));
+      const origin = see(sum(apply(poses[k].m, data.camera_origin), poses[k].p));
+      const far = [0, 3, 6, 9].map((n) => see(sum(apply(poses[k].m, data.camera_corners.slice(n, n + 3)), poses[k].p)));
       context.globalAlpha = at(c.outcome, time) === "used" ? 0.9 : 0.25;
       far.forEach((corner) => line([origin, corner], colour, 0.8));
       line([...far, far[0]], colour, 0.8);

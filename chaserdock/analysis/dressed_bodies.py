@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bodies of a scenario as coloured meshes for films: target with foil, cells and markers, chasers
-as satellites with their numbers.
+"""Bodies of a scenario as coloured meshes for films, replay and viewer: target with foil, cells and
+markers, chasers as satellites with their numbers.
 
 Shapes claim no more than the scenario states. A chaser without a mesh is a dressed cuboid: rails,
 foil, cells and paint within its stated size; its thrusters at their stated places, on thin struts
@@ -9,19 +9,29 @@ where these are outside of the cuboid; probe and lens at theirs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, Vector3
-from chaserdock_models.meshes import Material, MeshPart, Texture, TriangleMesh, moved
+from chaserdock_models.meshes import (
+    Material,
+    MeshPart,
+    Texture,
+    TriangleMesh,
+    TriangleSoup,
+    moved,
+    triangle_soup,
+)
 from chaserdock_models.satellites import box, lathe, satellite
-from chaserdock_models.targets import Box, TargetModel, face_extent, face_rotation
+from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, face_rotation
 from chaserdock_protocol.scenario import FlightScenario
+from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
 
-from .scene import filled_runs, marker_decals
+from .plots import colour
 
 Rgb = tuple[float, float, float]
 
@@ -41,6 +51,11 @@ _LENS_M = 0.022
 """Radius (m) of the painted lens: that of a small star tracker's."""
 _DIGIT_ROWS = 28
 """Rows of the bitmap that a number is painted from: edges finer than a pixel of the film."""
+AMBIENT = 0.22
+"""Share of ambient light: less than in the cameras' images, so that shadows are dark, but the
+shaded side is visible."""
+GAMMA = 0.6
+"""Exponent of the grey levels for display, as in snapshots."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +78,8 @@ BLACK = Coat((0.05, 0.05, 0.055))
 METAL = Coat((0.36, 0.37, 0.39), (0.40, 0.40, 0.42), 35.0, metal=True)
 NOZZLE = Coat((0.16, 0.15, 0.15), (0.25, 0.24, 0.22), 18.0, metal=True)
 LENS = Coat((0.02, 0.02, 0.05), (0.5, 0.5, 0.6), 90.0)
-MARKER = {242: Coat((0.90, 0.90, 0.90)), 13: Coat((0.04, 0.04, 0.04))}
+PAPER, INK = Coat((0.90, 0.90, 0.90)), Coat((0.04, 0.04, 0.04))
+"""Coats of the white and of the black of markers."""
 
 _COATS = {
     "insulation": FOIL,
@@ -121,12 +137,22 @@ class DressedBody:
                 "coat", coat.rgb[channel], coat.specular[channel], coat.exponent, coat.texture
             )
             parts.append(replace(part, material=surface))
-        return TriangleMesh("film", tuple(parts), {})
+        return TriangleMesh("channel", tuple(parts), {})
+
+    def surfaces(self) -> dict[Coat, TriangleSoup]:
+        """Return the triangles of each coat."""
+        coats: dict[Coat, list[MeshPart]] = {}
+        for part, coat in self.parts:
+            coats.setdefault(coat, []).append(part)
+        return {
+            coat: triangle_soup(TriangleMesh("coat", tuple(parts), {}))
+            for coat, parts in coats.items()
+        }
 
     def white(self) -> TriangleMesh:
         """Return the body all white, which shows what it covers."""
         parts = [replace(part, material=Material("white", 1.0)) for part, _ in self.parts]
-        return TriangleMesh("film", tuple(parts), {})
+        return TriangleMesh("white", tuple(parts), {})
 
 
 def target_body(scenario: FlightScenario) -> DressedBody:
@@ -139,7 +165,7 @@ def target_body(scenario: FlightScenario) -> DressedBody:
     model = scenario.target_model()
     for shape in model.boxes:
         body.add(FOIL, _cuboid("box", shape))
-    add_markers(body, model, MARKER, _LIFT_M)
+    add_markers(body, model, PAPER, INK, _LIFT_M)
     for port in scenario.docking.ports:
         radius_m = scenario.docking.tolerances.lateral_m
         rings = ((radius_m, METAL, 4), (0.6 * radius_m, BLACK, 5))
@@ -149,10 +175,19 @@ def target_body(scenario: FlightScenario) -> DressedBody:
     return body
 
 
-def chaser_body(scenario: FlightScenario, number: int, tint: Rgb) -> DressedBody:
-    """Return a chaser in its colour (red, green, blue, 0 to 1), its number painted on."""
+def tint(chaser: int) -> Array:
+    """Return a chaser's colour (3,), BGR, 0 to 255: that of the figures, lightened for the dark
+    background.
+    """
+    rgb = np.array(to_rgb(colour(chaser)))
+    return (255.0 * (0.78 * rgb + 0.22))[::-1]
+
+
+def chaser_body(scenario: FlightScenario, number: int) -> DressedBody:
+    """Return a chaser in its colour, its number painted on."""
     own, body = scenario.chaser, DressedBody()
-    coloured = Coat(tint, (0.08, 0.08, 0.08), 15.0)
+    blue, green, red = (0.85 * (tint(number) / 255.0) ** 1.6).tolist()  # as paint
+    coloured = Coat((red, green, blue), (0.08, 0.08, 0.08), 15.0)
     if own.mesh:
         shape = satellite(own.mesh)
         low, high = shape.bounds_m()
@@ -266,25 +301,54 @@ def _paint_number(
     quads = []
     for row in range(_DIGIT_ROWS):
         y0, y1 = ((_DIGIT_ROWS / 2.0 - k) * pitch_m * 2.0 / up for k in (row, row + 1))
-        for first, last in filled_runs(cells[row]):
+        for first, last in _filled_runs(cells[row]):
             x0, x1 = ((k - columns / 2.0) * pitch_m * 2.0 / right for k in (first, last))
             quads.append(place(np.array([[x0, y0], [x0, y1], [x1, y1], [x1, y0]])))
     body.add_quads(WHITE, quads, 3 * _LIFT_M)
 
 
+def _filled_runs(row: NDArray[np.bool_]) -> list[list[int]]:
+    """Return begin and end of each run of filled cells of a row (N,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
+    return edges.reshape(-1, 2).tolist()
+
+
+def _marker_quads(model: TargetModel, marker: Marker) -> tuple[Array, ...]:
+    """Return the quadrangles (4, 3), TRF, of a marker: white border, black square, then the white
+    cells row by row.
+    """
+    table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, model.dictionary))
+    n = table.markerSize + 2
+    cells = np.asarray(cv2.aruco.generateImageMarker(table, marker.id, n, borderBits=1)) > 0
+    top_left, top_right, _, bottom_left = marker.corners_trf_m()
+    right, down = top_right - top_left, bottom_left - top_left
+
+    def quad(x0: float, y0: float, x1: float, y1: float) -> Array:
+        return np.array(
+            [top_left + x * right + y * down for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+        )
+
+    margin = model.white_margin_m / marker.side_m
+    out = [quad(-margin, -margin, 1 + margin, 1 + margin), quad(0, 0, 1, 1)]
+    for row in range(n):
+        for first, last in _filled_runs(cells[row]):
+            out.append(quad(first / n, row / n, last / n, (row + 1) / n))
+    return tuple(out)
+
+
 def add_markers(
-    body: DressedBody, model: TargetModel, coats: Mapping[int, Coat], lift_m: float
+    body: DressedBody, model: TargetModel, paper: Coat, ink: Coat, lift_m: float
 ) -> None:
     """Add the markers of a target: white borders, black squares, white cells, each ``lift_m`` above
-    the last. ``coats``: of white (242) and black (13).
+    the last.
     """
-    layers: list[tuple[list[Array], int]] = [([], 242), ([], 13), ([], 242)]
+    layers: tuple[list[Array], ...] = ([], [], [])
     for marker in model.markers:
-        border, square, *cells = marker_decals(model, marker)
-        for (quads, _), new in zip(layers, ([border], [square], cells), strict=True):
-            quads += [_within(model.boxes, quad)[[3, 2, 1, 0]] for quad, _ in new]
-    for layer, (quads, grey) in enumerate(layers):
-        body.add_quads(coats[grey], quads, (layer + 1) * lift_m)
+        border, square, *cells = _marker_quads(model, marker)
+        for quads, new in zip(layers, ([border], [square], cells), strict=True):
+            quads += [_within(model.boxes, quad)[[3, 2, 1, 0]] for quad in new]
+    for layer, (quads, coat) in enumerate(zip(layers, (paper, ink, paper), strict=True)):
+        body.add_quads(coat, quads, (layer + 1) * lift_m)
 
 
 def _within(boxes: Sequence[Box], quad: Array) -> Array:

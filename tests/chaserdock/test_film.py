@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from chaserdock.analysis.dressed_bodies import Coat
 from chaserdock_models import rotations
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.scenario import load_scenario
@@ -19,6 +18,7 @@ from chaserdock_world.rendering.background import Light
 from numpy.typing import NDArray
 
 from chaserdock.analysis.chase_camera import Shot, Viewpoint
+from chaserdock.analysis.dressed_bodies import Coat
 from chaserdock.analysis.video import FastBodies
 from chaserdock.cli.main import app
 from chaserdock.datasets.views import ViewLimits, ViewRenderer

@@ -37,8 +37,8 @@ Try next:
 
 
 def demo(out: OutOpt = None) -> None:
-    """Fly the last half metre of a docking, and write its report and film. Status 0 only if the
-    chaser is latched.
+    """Fly the last quarter of a metre of a docking, and write its report and film. Status 0 only if
+    the chaser is latched.
 
     The viewer shows the flight; a browser opens it where there is a display.
     """

@@ -86,9 +86,10 @@ class Causes:
 
     def disturbs_thrusters(self, now_s: float) -> bool:
         """Return whether thrusters may give something other than commanded, because of failures,
-        lost or late messages, or recent faults.
+        lost or late messages, or recent faults, partitions or slow readers.
         """
-        recent = any(lasting(self.faults, now_s, DEVICES_SETTLE_S))
+        until_s = self.lasted_until_s(self.faults, now_s)
+        recent = until_s > 0.0 and now_s - until_s <= DEVICES_SETTLE_S
         return bool(self._thrusters_fail or recent or self.late_messages)
 
     def keep_commands_until_s(self, name: str, now_s: float) -> float:

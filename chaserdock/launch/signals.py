@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -39,8 +40,25 @@ class StopRequested(KeyboardInterrupt):
     """
 
 
-def _request_stop(*_: object) -> None:
-    raise StopRequested
+_AGAIN_S = 0.05
+"""Time, s, after which a signal that met an import is sent again: less than anybody notices."""
+
+
+def _request_stop(number: int, frame: FrameType | None) -> None:
+    """Raise StopRequested; within an import after it, as packages take any exception there for
+    another package that is missing.
+    """
+    if not _is_importing(frame):
+        raise StopRequested
+    again = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
+    again.daemon = True
+    again.start()
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
+        frame = frame.f_back
+    return frame is not None
 
 
 @contextmanager

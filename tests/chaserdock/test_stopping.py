@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from harness import ROOT, chaserdock
 
 from chaserdock.cli import main as program
 from chaserdock.launch.launcher import free_port
+from chaserdock.launch.signals import StopRequested, interrupts
 
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
 
@@ -38,6 +40,19 @@ def test_signal_ends_a_command_that_does_not_handle_it(
         signal.signal(signal.SIGTERM, before)
     assert ended.value.code == 130
     assert capsys.readouterr().err == "chaserdock: stopped\n"
+
+
+def test_a_signal_within_an_import_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a package that takes any exception for a missing one, as trimesh does."""
+    kill = "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGTERM)\n    sum(range(10))"
+    (tmp_path / "swallows.py").write_text(f"{kill}\nexcept BaseException:\n    pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with interrupts():
+        importlib.import_module("swallows")
+        with pytest.raises(StopRequested):
+            time.sleep(10.0)
 
 
 def handles_sigterm(process: subprocess.Popen[bytes]) -> bool:

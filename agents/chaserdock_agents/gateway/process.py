@@ -54,8 +54,8 @@ _POLL_S = 0.001
 """
 _LONGEST_SOURCE = 200
 """Characters of a device's address that a message repeats."""
-_POSE_PATIENCE_S = 10.0
-"""Wait, s, for the first odometry of all robots: devices were opened long before."""
+_POSE_PATIENCE_S = 30.0
+"""Wait, s, for the first odometry of all robots: names are found on a loaded network in ten."""
 _SETTLING_NS = 200_000_000
 """Time, ns, whose poses must give the first odometry."""
 

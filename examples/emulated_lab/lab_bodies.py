@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bodies of the emulated laboratory: robots with thrusters, and a target with ports.
 
-Rigid bodies, moved by Euler steps of 2 ms. Touch and latch are springs with
-dampers. Shares no code with chaserdock.
+Rigid bodies, moved by Euler steps of 2 ms. Touch and latch are springs with dampers. Shares no code
+with chaserdock.
 """
 
 from __future__ import annotations

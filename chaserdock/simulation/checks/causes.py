@@ -81,15 +81,14 @@ class Causes:
     def hands_over(self, now_s: float) -> bool:
         """Return whether the network, or a fault within the last ``FOLLOWING_S``, explains that
         the other controller commands."""
-        until_s = self.lasted_until_s((f for f in self.faults if f.kind not in HARMLESS), now_s)
-        return self.late_messages or (until_s > 0.0 and now_s - until_s <= FOLLOWING_S)
+        harmful = (f for f in self.faults if f.kind not in HARMLESS)
+        return self.late_messages or self._lasted(harmful, now_s, FOLLOWING_S)
 
     def disturbs_thrusters(self, now_s: float) -> bool:
         """Return whether thrusters may give something other than commanded, because of failures,
         lost or late messages, or recent faults, partitions or slow readers.
         """
-        until_s = self.lasted_until_s(self.faults, now_s)
-        recent = until_s > 0.0 and now_s - until_s <= DEVICES_SETTLE_S
+        recent = self._lasted(self.faults, now_s, DEVICES_SETTLE_S)
         return bool(self._thrusters_fail or recent or self.late_messages)
 
     def keep_commands_until_s(self, name: str, now_s: float) -> float:
@@ -106,6 +105,13 @@ class Causes:
         windows = (*self.network.partition, *self.network.slow)
         spans += [(w.at_s, w.at_s + w.duration_s) for w in windows]
         return max([0.0, *(min(end_s, now_s) for at_s, end_s in spans if at_s <= now_s)])
+
+    def _lasted(self, faults: Iterable[Fault], now_s: float, after_s: float) -> bool:
+        """Return whether one of the faults, a partition or a slow reader lasts, or ended at most
+        ``after_s`` ago.
+        """
+        until_s = self.lasted_until_s(faults, now_s)
+        return until_s > 0.0 and now_s - until_s <= after_s
 
 
 def keeps_commands(fault: Fault, name: str) -> bool:

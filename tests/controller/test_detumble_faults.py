@@ -161,15 +161,11 @@ def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "plan_s"), [(16, None), (6, 13.5)])
-def test_a_stack_of_many_chasers_is_stopped(count: int, plan_s: float | None) -> None:
-    """Up to four at each of four faces, side by side. Their thrusters stop it within a few seconds,
-    or at less cost by a plan.
-    """
-    changes = wrong_knowledge(1) + ([] if plan_s is None else [f"detumble.plan_s={plan_s}"])
-    four = stack_scenario(1, (0, 1, 2, 3), changes)
+def test_a_stack_of_sixteen_chasers_is_stopped() -> None:
+    """Four at each of four faces, side by side. Their thrusters stop it within a few seconds."""
+    four = stack_scenario(1, (0, 1, 2, 3), wrong_knowledge(1))
     ports, chasers = [], []
-    for i in range(count):
+    for i in range(16):
         port, chaser = four.docking.ports[i % 4], four.chasers[i % 4]
         aside, up = ((-0.22, -0.22), (0.22, 0.22), (-0.22, 0.22), (0.22, -0.22))[i // 4]
         shift = np.array([-aside * port.axis[1], aside * port.axis[0], up])
@@ -187,12 +183,12 @@ def test_a_stack_of_many_chasers_is_stopped(count: int, plan_s: float | None) ->
                 "limits": four.limits.model_copy(update={"min_distance_chasers_m": 0.3}),
             }
         ),
-        5.0 if plan_s is None else 16.0,
+        5.0,
     )
     assert flight.time_s is not None
-    assert flight.time_s < (4.0 if plan_s is None else 15.0)
+    assert flight.time_s < 4.0
     assert flight.least is not None
-    assert flight.impulse_N_s < (1.0 if plan_s is None else 0.85) * flight.least.impulse_N_s
+    assert flight.impulse_N_s < flight.least.impulse_N_s
 
 
 @pytest.mark.slow

@@ -213,11 +213,12 @@ def momentum_drifts(worlds: Any, seconds: int) -> list[float]:
 
 @both
 def test_a_tumbling_stack_conserves_momentum(worlds: Any) -> None:
-    """To a tenth of what 300 s are allowed."""
+    """To a tenth of what 300 s are allowed, in a tenth of the time."""
     assert max(momentum_drifts(worlds, 30)) <= 1e-4
 
 
 @both
 @pytest.mark.slow
-def test_a_tumbling_stack_conserves_momentum_for_300_s(worlds: Any) -> None:
-    assert max(momentum_drifts(worlds, 300)) <= 1e-3
+def test_a_tumbling_stack_conserves_momentum_for_long(worlds: Any) -> None:
+    """To a third of what 300 s are allowed, in a third of the time."""
+    assert max(momentum_drifts(worlds, 100)) <= 1e-3 / 3.0

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The renderer of meshes: processor time, and its images against those of the ray tracer Embree.
 
-Time: of one image of 960 x 540 pixels of each shipped satellite at 1 and 3 m, random attitudes and
-suns, one thread; the least of four runs of each view. Accuracy: 480 x 270 pixels with 36 rays each:
+Time: of one image of 960 x 540 pixels of each shipped satellite, and beside it of the box of the
+main job by the renderer of boxes, at 1 and 3 m, random attitudes and suns, one thread; the least of
+four runs of each view. Accuracy: 480 x 270 pixels with 36 rays each:
 mean grey-level error inside surfaces, and the displacement of silhouettes and shadow edges by
 blocks of 12 pixels; without textures.
 """
@@ -15,12 +16,17 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.satellites import satellite
+from chaserdock_models.targets import target_model
 from chaserdock_protocol.scenario.camera import Effects
+from chaserdock_world.rendering.cameras import SceneRenderer
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer
+from chaserdock_world.rendering.rasterizer import Renderer
 from common import Figures, Group, Options, percentiles
 from markerless_cases import random_view
 
 SATELLITES = ("geo_servicer", "cubesat_12u")
+BOX = "paper"
+"""Target of the main job."""
 RANGES_M = (1.0, 3.0)
 RUNS = 4
 """Repetitions of which the least time counts: other programs prolong some."""
@@ -30,8 +36,12 @@ def measure_time(options: Options) -> Figures:
     """Time images of meshes by satellite and range."""
     views = views_of(options)
     camera, figures = Camera.from_hfov(960, 540, np.deg2rad(60.0)), {}
-    for name in SATELLITES:
-        renderer = MeshRenderer(camera, satellite(name), None, Effects().point_spread_px)
+    spread_px = Effects().point_spread_px
+    renderers: dict[str, SceneRenderer] = {
+        name: MeshRenderer(camera, satellite(name), None, spread_px) for name in SATELLITES
+    }
+    renderers[BOX] = Renderer(camera, target_model(BOX), None, spread_px)
+    for name, renderer in renderers.items():
         for range_m in RANGES_M:
             rng, times = np.random.default_rng(1), []
             for _ in range(views):

@@ -55,7 +55,9 @@ _POLL_S = 0.001
 _LONGEST_SOURCE = 200
 """Characters of a device's address that a message repeats."""
 _POSE_PATIENCE_S = 30.0
-"""Wait, s, for the first odometry of all robots: names are found on a loaded network in ten."""
+"""Wait, s, for the first odometry of all robots, unless an option states another: names are found
+on a loaded network in ten.
+"""
 _SETTLING_NS = 200_000_000
 """Time, ns, whose poses must give the first odometry."""
 
@@ -188,6 +190,7 @@ class Gateway:
         nothing.
         """
         begun_s = self._node.host.now_s()
+        patience_s = self._host.options.patience_s or _POSE_PATIENCE_S
         while not stop():
             self._lab.read_odometry()
             for _ in self._lab.read_images():
@@ -200,8 +203,8 @@ class Gateway:
             ]
             if not late:
                 return ""
-            if self._node.host.now_s() - begun_s > _POSE_PATIENCE_S:
-                return f"no odometry within {_POSE_PATIENCE_S:g} s: {', '.join(late)}"
+            if self._node.host.now_s() - begun_s > patience_s:
+                return f"no odometry within {patience_s:g} s: {', '.join(late)}"
             self._barrier.process_until(self._node.host.now_s() + _POLL_S)
         return "stopped before the first tick"
 

@@ -99,7 +99,7 @@ def find_child(
     while time.monotonic() < deadline:
         for child in descendants(process):
             try:
-                line = child.cmdline()
+                line = " ".join(child.cmdline()).split()  # a process' title is one word
             except (psutil.NoSuchProcess, psutil.ZombieProcess):
                 continue
             if any(tuple(line[k : k + len(words)]) == words for k in range(len(line))):

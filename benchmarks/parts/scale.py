@@ -104,11 +104,12 @@ def parts_of(scenario: Scenario, ticks: int) -> dict[str, float]:
 def cpu_s_of(launcher: psutil.Process) -> dict[str, float]:
     """Return the processor time, s, of the mission's processes so far by command."""
     used: dict[str, float] = defaultdict(float)
-    for child in launcher.children():
+    for child in launcher.children(recursive=True):
         with suppress(psutil.NoSuchProcess, psutil.AccessDenied):
-            arguments, times = child.cmdline(), child.cpu_times()
-            if "chaserdock" in arguments:
-                used[arguments[arguments.index("chaserdock") + 1]] += times.user + times.system
+            program, command, *_ = *" ".join(child.cmdline()).split(), ""
+            times = child.cpu_times()
+            if program == "chaserdock":
+                used[command] += times.user + times.system
     return used
 
 

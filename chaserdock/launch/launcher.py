@@ -19,7 +19,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, get_args
+from typing import IO, Any, get_args
 
 import psutil
 from chaserdock_agents.router.process import NAME as ROUTER
@@ -43,6 +43,7 @@ from chaserdock.exit_codes import DONE, FAILED, STOPPED
 from chaserdock.terminal import labelled
 
 from .container import is_listening
+from .fork_server import ForkedProcess, ForkServer
 from .json_events import Failed, JsonLine, Result, Start
 from .mission_address import MissionAddress, remove_address, write_address
 from .progress import ProgressReporter, Show, print_json_line
@@ -82,7 +83,7 @@ class Child:
     """A process of the mission, and the file of its output."""
 
     name: str
-    process: subprocess.Popen[bytes]
+    process: subprocess.Popen[bytes] | ForkedProcess
     output: Path
 
     def last_line(self) -> str:
@@ -105,8 +106,9 @@ _ZENOH_THREADS = "(rx: (worker_threads: 1))"
 
 @dataclass
 class Fleet:
-    """Processes of a mission."""
+    """Processes of a mission. ``server``: starts them in place of a Python interpreter for each."""
 
+    server: ForkServer | None = None
     children: list[Child] = field(default_factory=list[Child])
     peak_memory_bytes: int = 0
     cpu_s: dict[str, float] = field(default_factory=dict[str, float])
@@ -119,21 +121,32 @@ class Fleet:
         threads = {"ZENOH_RUNTIME": _ZENOH_THREADS} if name != ROUTER else {}
         with errors_of_writing(output, RunError):
             out = output.open("wb")
+        environment = {**threads, **os.environ, **SINGLE_THREADED}
         with out, deferred_signals():
-            process = subprocess.Popen(
-                [sys.executable, "-m", "chaserdock", *arguments, "--watch-parent"],
-                stdin=subprocess.PIPE,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-                env={**threads, **os.environ, **SINGLE_THREADED},
-                # The launcher forwards Ctrl-C. Not a new session: Linux would share the cores
-                # between sessions ("autogroup") whatever the processes' priorities, and the last
-                # one to wake up would wait longest.
-                process_group=0,
-            )
+            process = self._started([*arguments, "--watch-parent"], environment, out)
             # Append now: a signal handler may raise an exception, after which ``end`` ends the
             # listed processes.
             self.children.append(Child(name, process, output))
+
+    def _started(
+        self, arguments: list[str], environment: dict[str, str], out: IO[bytes]
+    ) -> subprocess.Popen[bytes] | ForkedProcess:
+        if self.server is not None:
+            try:
+                return self.server.start(arguments, environment, out)
+            except OSError as error:
+                raise RunError(f"{arguments[0]}: cannot be started: {error}") from None
+        return subprocess.Popen(
+            [sys.executable, "-m", "chaserdock", *arguments],
+            stdin=subprocess.PIPE,
+            stdout=out,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            # The launcher forwards Ctrl-C. Not a new session: Linux would share the cores between
+            # sessions ("autogroup") whatever the processes' priorities, and the last one to wake up
+            # would wait longest.
+            process_group=0,
+        )
 
     def running(self) -> list[Child]:
         """Return the processes that have not exited."""
@@ -176,6 +189,13 @@ class Fleet:
             child.process.wait()
             if child.process.stdin is not None:
                 child.process.stdin.close()
+        if self.server is not None:
+            self.server.close()
+
+
+def _forked_fleet() -> Fleet:
+    """Return a fleet with a fork server, where the system has what it needs."""
+    return Fleet(ForkServer() if sys.platform == "linux" else None)
 
 
 @dataclass
@@ -361,7 +381,7 @@ def fly_mission(
     # process instead.
     lease_ms = 2_000 if mode == "realtime" else 600_000
 
-    fleet, observers, hub = Fleet(), Fleet(), None
+    fleet, observers, hub = _forked_fleet(), Fleet(), None
     reporter = ProgressReporter(scenario, show, emit)
 
     try:

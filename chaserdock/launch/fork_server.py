@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import runpy
 import select
 import shlex
 import signal
@@ -23,13 +24,6 @@ from typing import IO, Any
 import setproctitle
 from chaserdock_protocol.process import SINGLE_THREADED
 
-_IMPORTED = (
-    "chaserdock.cli.main",
-    "chaserdock_world.process",
-    "chaserdock_controller.process",
-    "chaserdock_agents.chaser.process",
-    "chaserdock_agents.recorder.process",
-)
 _MESSAGE_BYTES = 1 << 20
 """Largest message: arguments and environment of a process."""
 _ENDED = os.WEXITED | os.WNOHANG | os.WNOWAIT
@@ -145,9 +139,7 @@ def serve(launcher: socket.socket) -> list[str] | None:
     Returns the arguments in each new process, and None in the server.
     """
     setproctitle.setproctitle("chaserdock fork server")  # also needed before environments change
-    for name in _IMPORTED:
-        with suppress(ImportError):  # the process that needs it says what is missing
-            import_module(name)
+    _import_what_processes_need()
     gc.freeze()  # a collection would copy the pages that processes share
     woken, waker = socket.socketpair()
     for end in (woken, waker):
@@ -181,6 +173,15 @@ def serve(launcher: socket.socket) -> list[str] | None:
         launcher.send(json.dumps({"started": pid}).encode())
 
 
+def _import_what_processes_need() -> None:
+    with suppress(ImportError):  # the process that needs it says what is missing
+        import_module("chaserdock_world.process")
+        import_module("chaserdock_controller.process")
+        import_module("chaserdock_agents.chaser.process")
+        import_module("chaserdock_agents.recorder.process")
+        import_module("typer")
+
+
 def _wake(*_: object) -> None:
     """Let Python write to the wake-up descriptor: an ignored signal would not."""
 
@@ -212,8 +213,6 @@ def _is_readable(end: socket.socket) -> bool:
 
 if __name__ == "__main__":
     if (arguments := serve(socket.socket(fileno=int(sys.argv[1])))) is not None:
-        from chaserdock.__main__ import main
-
         sys.argv = ["chaserdock", *arguments]
         setproctitle.setproctitle(shlex.join(sys.argv))
-        main()
+        runpy.run_module("chaserdock", run_name="__main__")

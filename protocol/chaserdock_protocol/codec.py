@@ -83,7 +83,7 @@ class _FieldGetters(NamedTuple):
     rows: Callable[[Any], tuple[tuple[float, ...], ...]] | None
     quaternions: Callable[[Any], tuple[tuple[float, ...], ...]] | None
     covariances: Callable[[Any], tuple[tuple[float, ...], ...]] | None
-    parts: Callable[[Any], tuple[tuple[Struct, ...], ...]] | None
+    parts: Callable[[Any], tuple[tuple[Struct, ...] | None, ...]] | None
     optional: Callable[[Any], tuple[Struct | None, ...]] | None
 
 
@@ -115,14 +115,16 @@ def _passes_fast_check(message: Struct) -> bool:
 
 
 def _parts_pass_fast_check(message: Struct, getters: _FieldGetters) -> bool:
-    parts, optional = getters.parts, getters.optional
-    if optional is not None and not all(
-        p is None or _passes_fast_check(p) for p in optional(message)
-    ):
-        return False
-    return parts is None or all(
-        _passes_fast_check(part) for several in parts(message) for part in several
-    )
+    if getters.optional is not None:
+        for part in getters.optional(message):
+            if part is not None and not _passes_fast_check(part):
+                return False
+    if getters.parts is not None:
+        for several in getters.parts(message):
+            for part in several or ():
+                if not _passes_fast_check(part):
+                    return False
+    return True
 
 
 @cache
@@ -142,7 +144,12 @@ def _field_getters(kind: type[Struct]) -> _FieldGetters | None:
         match field.type:
             case inspect.FloatType():
                 numbers.append(field.name)
-            case inspect.VarTupleType(item_type=inspect.StructType()):
+            case (
+                inspect.VarTupleType(item_type=inspect.StructType())
+                | inspect.UnionType(
+                    types=(inspect.VarTupleType(item_type=inspect.StructType()), inspect.NoneType())
+                )
+            ):
                 parts.append(field.name)
             case inspect.UnionType(types=(inspect.StructType(), inspect.NoneType())):
                 optional.append(field.name)

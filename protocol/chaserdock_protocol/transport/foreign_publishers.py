@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 
 from chaserdock_protocol import topics
@@ -19,12 +19,13 @@ MOST_REPORTED = 16
 class ForeignPublishers:
     """Recognize samples of other sessions than the world's, and report each such session once.
 
-    ``world_source``: session of the world; empty accepts all. Samples are checked on any thread,
-    reports are made on the reader's.
+    ``world_source``: session of the world; empty accepts all. ``rejected``: counts foreign samples
+    by key. Samples are checked on any thread, reports are made on the reader's.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, rejected: Counter[str]) -> None:
         self.world_source = ""
+        self._rejected = rejected
         self._report: Callable[[str, str, Message | None], None] = lambda key, source, newest: None
         self._known: set[str] = set()
         self._unreported: deque[tuple[str, str]] = deque()
@@ -36,7 +37,9 @@ class ForeignPublishers:
         self.world_source, self._report = source, report
 
     def sent(self, raw: RawSample) -> bool:
-        """Return whether a foreign session has sent a sample on a key of the world."""
+        """Return whether a foreign session has sent a sample on a key of the world, and count
+        it.
+        """
         if raw.source == self.world_source or not self.world_source:
             return False
         if not raw.key.startswith(topics.WORLD_BRANCHES):
@@ -44,6 +47,7 @@ class ForeignPublishers:
         if raw.source not in self._known and len(self._known) < MOST_REPORTED:
             self._known.add(raw.source)
             self._unreported.append((raw.key, raw.source))
+        self._rejected[f"{raw.key}:foreign publisher"] += 1
         return True
 
     def report_next(self, newest: Message | None) -> None:

@@ -84,7 +84,7 @@ class Node:
         self._close_callbacks: list[Callable[[], None]] = []
         self.run_id = ""
         """Mission that the process has joined, empty before."""
-        self._foreign = ForeignPublishers()
+        self._foreign = ForeignPublishers(self.counts.rejected)
         self._sessions = ProcessSessions()
         self._newest: Message | None = None
         network: Network = ZenohNetwork(link) if link.network is None else link.network
@@ -111,16 +111,6 @@ class Node:
         session, up to a number of sessions; ``newest``: the last valid message.
         """
         self._foreign.expect(source, on_foreign)
-
-    def _is_foreign(self, raw: RawSample) -> bool:
-        """Return whether a message on the world's keys is not the world's, and count it.
-
-        Runs on the network's or the reader's thread.
-        """
-        foreign = self._foreign.sent(raw)
-        if foreign:
-            self.counts.rejected[f"{raw.key}:foreign publisher"] += 1
-        return foreign
 
     # -- publishing --------------------------------------------------------------------------------
 
@@ -186,7 +176,7 @@ class Node:
 
         def arrived(raw: RawSample) -> None:
             key = raw.key
-            if self._is_foreign(raw):
+            if self._foreign.sent(raw):
                 return
             found = topics.topic_of_key(key)
             if found is None or found[0] is not topic:
@@ -246,7 +236,7 @@ class Node:
             raise PermissionError(f"{self.role} may not read {expression}")
 
         def own_mission(raw: RawSample) -> None:
-            if not self._is_foreign(raw):
+            if not self._foreign.sent(raw):
                 arrived(raw)
 
         self._connection.subscribe(expression, own_mission)
@@ -303,7 +293,7 @@ class Node:
     def _decode(
         self, topic: Topic, place: str | None, raw: RawSample, arrived_s: float = 0.0
     ) -> ReceivedMessage | None:
-        if self._is_foreign(raw):  # arrived through a ring buffer, or before `expect_world`
+        if self._foreign.sent(raw):  # arrived through a ring buffer, or before `expect_world`
             return None
         try:
             message: Any = self._connection.decode(topic.kind, raw)
@@ -322,7 +312,7 @@ class Node:
             case Tick():
                 self._sessions.list_instances(message.chaser_instances)
                 self._sessions.list_instances(message.controllers)
-            case _ if self.is_forged(received):
+            case _ if self._is_forged(topic, raw.key, raw.source):
                 return None
         return received
 
@@ -331,10 +321,13 @@ class Node:
 
         A message that was received earlier may turn out to be forged when its process is known.
         """
-        key = received.topic.key_of(received.place)
-        forged = self._sessions.is_foreign(key, received.source)
+        topic = received.topic
+        return self._is_forged(topic, topic.key_of(received.place), received.source)
+
+    def _is_forged(self, topic: Topic, key: str, source: str) -> bool:
+        forged = self._sessions.is_foreign(key, source)
         if forged:
-            self.counts.rejected[f"{received.topic.key}:foreign publisher"] += 1
+            self.counts.rejected[f"{topic.key}:foreign publisher"] += 1
         return forged
 
     # -- queries and liveliness --------------------------------------------------------------------

@@ -56,8 +56,8 @@ class _LogFileWriter(Writer):
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
         """See ``Writer.add_message``."""
-        self._chunk.append(channel_id, log_time, data, publish_time, sequence)
-        if self._chunk.count > CHUNK_BYTES:
+        size = self._chunk.append(channel_id, log_time, data, publish_time, sequence)
+        if size > CHUNK_BYTES:
             self._finish_chunk()
 
 
@@ -71,8 +71,8 @@ class _Chunk(ChunkBuilder):
 
     def append(
         self, channel: int, log_time: int, data: bytes, publish_time: int, sequence: int
-    ) -> None:
-        """Append a message record."""
+    ) -> int:
+        """Append a message record. Returns the size of the chunk, bytes."""
         buffer: BytesIO = self.record_writer._buffer  # pyright: ignore[reportPrivateUsage]
         index = self.message_indices.get(channel)
         if index is None:
@@ -95,6 +95,7 @@ class _Chunk(ChunkBuilder):
             total.message_end_time = log_time
         total.message_count += 1
         total.channel_message_counts[channel] += 1
+        return buffer.tell()
 
 
 class _MessageIndex:

@@ -36,7 +36,7 @@ from chaserdock_controller.estimation.types import (
 from chaserdock_controller.interfaces import RelativePose, TargetState
 
 from .between_ticks import split_tick
-from .hypotheses import FilterState, is_lost, mixture_covariance, target_state
+from .hypotheses import FilterState, mixture_covariance, target_state
 from .measurements import mounting_of
 from .parameters import JointParameters, TargetParameters, rows_of
 from .prediction import disturbance, predict_target
@@ -56,7 +56,7 @@ from .state import (
     block,
     with_body,
 )
-from .tick import lost_limits, process_tick
+from .tick import is_target_lost, process_tick
 
 _IDENTITY_3 = np.eye(3)
 _NO_DISTURBANCE = np.zeros(6)
@@ -161,7 +161,7 @@ class JointEstimator(Estimator):
         predicted = [predict_target(with_body(h, p.target), time_ns, p) for h in state.hypotheses]
         hypotheses, covariances = zip(*predicted, strict=True)
         covariance = mixture_covariance(hypotheses, covariances)
-        lost = is_lost(covariance, lost_limits(state.hypotheses[0], p.target))
+        lost = is_target_lost(state.hypotheses[0], covariance, p.target)
         return target_state(state, time_ns, hypotheses[0], covariance, lost, p.target)
 
     def disturb(self, shock: Shock) -> None:

@@ -117,11 +117,6 @@ def is_lost(covariance: Array, p: TargetParameters) -> bool:
     return position_m > p.lost_position_m or attitude_rad > p.lost_attitude_rad
 
 
-def all_lost(state: FilterState, p: TargetParameters) -> bool:
-    """Test whether every hypothesis is too uncertain to be used."""
-    return all(is_lost(h.covariance, p) for h in state.hypotheses)
-
-
 def _weights(hypotheses: Sequence[JointState]) -> list[float]:
     """Return the probabilities of the hypotheses from their likelihoods and equal priors."""
     top = max(h.log_likelihood for h in hypotheses)

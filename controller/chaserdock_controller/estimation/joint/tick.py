@@ -21,10 +21,10 @@ from .floor import keep_on_floor
 from .hypotheses import (
     FilterState,
     TargetRates,
-    all_lost,
     before_restart,
     choose,
     count_measurements,
+    is_lost,
     rate_variances,
     rates_of,
     unknown_rates,
@@ -54,7 +54,14 @@ _BLAS = ThreadpoolController()
 """Limits BLAS to one thread: the last bits of a matrix product depend on the number of threads."""
 
 
-def lost_limits(state: JointState, target: TargetParameters) -> TargetParameters:
+def is_target_lost(state: JointState, covariance: Array, target: TargetParameters) -> bool:
+    """Test whether the pose of the target with this covariance (12+, 12+) is too uncertain to be
+    used at its distance from the chasers of ``state``.
+    """
+    return is_lost(covariance, target) and is_lost(covariance, _lost_limits(state, target))
+
+
+def _lost_limits(state: JointState, target: TargetParameters) -> TargetParameters:
     """Return the parameters with the standard deviation of position beyond which the target is
     lost.
 
@@ -71,6 +78,12 @@ def lost_limits(state: JointState, target: TargetParameters) -> TargetParameters
         if limit_m <= target.lost_position_m
         else dataclasses.replace(target, lost_position_m=limit_m)
     )
+
+
+def _all_lost(state: FilterState, target: TargetParameters) -> bool:
+    """Test whether every hypothesis is too uncertain to be used."""
+    best = state.hypotheses[0]
+    return all(is_target_lost(best, h.covariance, target) for h in state.hypotheses)
 
 
 def process_tick(
@@ -98,7 +111,7 @@ def process_tick(
     )
     if seen and not now.hypotheses[0].target_known:
         now = _start(now, seen, unknown_rates(p.target), mounting, p, "initialised", events)
-    elif seen and all_lost(now, lost_limits(now.hypotheses[0], p.target)):
+    elif seen and _all_lost(now, p.target):
         now = _reacquire(now, seen, mounting, p, events)
     elif seen:
         report = max(results, key=lambda r: r[0].log_likelihood)[1]
@@ -261,7 +274,7 @@ def _reacquire(
     """
     new_events: list[EstimatorEvent] = []
     fresh = _start(now, seen, rates_of(now.hypotheses[0]), mounting, p, "reacquired", new_events)
-    if all_lost(fresh, lost_limits(fresh.hypotheses[0], p.target)):
+    if _all_lost(fresh, p.target):
         return now
     events += new_events
     return replace(fresh, reinitialisations=now.reinitialisations + 1)

@@ -16,6 +16,9 @@ PLACEMENTS_HZ = 120
 between, a target that turns at 10 degrees/s moves by 0.6 mm at 0.4 m from its centre. The stated
 motion is exact at every step.
 """
+_PLACEMENTS_AT_ONCE = 120
+"""Placements that are computed together, a second: most of the time of a few is that of the calls.
+"""
 
 
 class PrescribedMotion:
@@ -26,6 +29,7 @@ class PrescribedMotion:
         self._every = max(1, self._physics_hz // PLACEMENTS_HZ)
         self._start = _start(scenario)
         self._moves = scenario.target.motion != "static"
+        self._first, self._placed = 0, _moved(self._start, np.zeros((0, 1)))
 
     def at(self, step: int) -> BodyState:
         """Return the target's state at a physics step."""
@@ -42,8 +46,19 @@ class PrescribedMotion:
         first = step - step % self._every + self._every
         if not self._moves or first > end:
             return None
-        times_s = np.arange(first, end + 1, self._every)[:, None] / self._physics_hz
-        return PlacementPath(body, first - step, self._every, _moved(self._start, times_s))
+        return PlacementPath(body, first - step, self._every, self._placements(first, end))
+
+    def _placements(self, first: int, end: int) -> BodyState:
+        """Return the states of the engine's copy at its placements from step ``first`` to ``end``:
+        positions (K, 3), attitudes (K, 4).
+        """
+        begin, count = (first - self._first) // self._every, (end - first) // self._every + 1
+        if not 0 <= begin <= len(self._placed.position_m) - count:
+            steps = first + self._every * np.arange(max(count, _PLACEMENTS_AT_ONCE))
+            self._placed = _moved(self._start, steps[:, None] / self._physics_hz)
+            self._first, begin = first, 0
+        s, part = self._placed, slice(begin, begin + count)
+        return BodyState(s.position_m[part], s.velocity_m_s, s.q_wxyz[part], s.omega_rad_s)
 
 
 def prescribed_state(scenario: Scenario, time_s: float) -> BodyState:

@@ -26,6 +26,10 @@ class ChaserOutputs:
     stale: bool = False
     rejected: str = ""
 
+    def __bool__(self) -> bool:
+        """Return whether anything follows."""
+        return bool(self.messages or self.stale or self.rejected)
+
 
 class Outbox:
     """Collects the outputs of chaser ``chaser`` from the parts of its core."""

@@ -140,8 +140,8 @@ class ChaserProcess:
 
     def _step(self, received: ReceivedMessage) -> None:
         started_s = self.node.host.now_s()
-        outputs = self.core.step(received, started_s)
-        self._publish(outputs, self.node.host.now_s() - started_s)
+        if outputs := self.core.step(received, started_s):
+            self._publish(outputs, self.node.host.now_s() - started_s)
 
     def _look(self, image: Image) -> None:
         """Look for the target in an image, in real time: beside the messages, as commands must not

@@ -39,6 +39,7 @@ from chaserdock_protocol.messages import (
     ThrusterReport,
     WrenchCommand,
 )
+from msgspec import Struct
 
 from .bodies.mass_properties import MassProperties
 from .bodies.target_body import TargetBody
@@ -50,8 +51,7 @@ ControlMode = Literal["nmpc", "track", "brake", "coast", "pull", "search", "detu
 # -- the tick --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class ChaserInputs:
+class ChaserInputs(Struct, frozen=True):
     """Messages of one chaser for a tick.
 
     ``odometry``: of the tick; extrapolated for a while if lost. ``outdated``: the newest one, if it
@@ -65,8 +65,7 @@ class ChaserInputs:
     docking: DockingStatus | None = None
 
 
-@dataclass(frozen=True)
-class TickInputs:
+class TickInputs(Struct, frozen=True):
     """Messages of a tick. Sightings may belong to earlier ticks. ``chasers``: those of which
     anything is known, in order.
     """
@@ -115,8 +114,7 @@ class AppliedImpulse(NamedTuple):
         return cls(impulse, np.zeros(6), np.abs(impulse))
 
 
-@dataclass(frozen=True, eq=False)
-class ChaserObservation:
+class ChaserObservation(Struct, frozen=True, eq=False):
     """What is known of one chaser in a tick before estimation.
 
     ``odometry``: its valid state, else None; ``invalid``: why it is not used, or empty.
@@ -159,8 +157,7 @@ class ChaserObservation:
         return self.docking is not None and self.docking.contact and not self.docking.latched
 
 
-@dataclass(frozen=True)
-class Observation:
+class Observation(Struct, frozen=True):
     """Result of ingest: checked inputs, and what follows from them for each of the ``chasers``.
 
     ``effective_ns``: time at which this tick's commands take effect.
@@ -222,8 +219,7 @@ class RelativePose:
     random_covariance: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class OwnMotion:
+class OwnMotion(Struct, frozen=True, eq=False):
     """Estimated motion of a chaser with valid odometry.
 
     ``state``: now. ``at_effect`` (13,): at ``Observation.effective_ns``; p, v (WRF), q_wxyz, omega
@@ -235,8 +231,7 @@ class OwnMotion:
     disturbance: Array
 
 
-@dataclass(frozen=True, eq=False)
-class ChaserEstimate:
+class ChaserEstimate(Struct, frozen=True, eq=False):
     """What is estimated of one chaser.
 
     ``own``: its motion, None without valid odometry. ``relative``: its pose relative to the target.
@@ -333,8 +328,7 @@ class TargetEstimation:
 # -- guidance --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class ReferencePose:
+class ReferencePose(Struct, frozen=True):
     """Reference of one chaser now: position (3,) and attitude (4,) in WRF, ``offset_m`` (3,) in
     TRF.
     """
@@ -345,8 +339,7 @@ class ReferencePose:
     min_distance_target_m: float
 
 
-@dataclass(frozen=True)
-class DirectCommand:
+class DirectCommand(Struct, frozen=True):
     """Wrench of a chaser that the NMPC does not fly: force and torque (6,), body axes.
 
     ``thrusts_N`` (n,): thrusts of its thrusters that give this wrench; None to leave the allocation
@@ -358,8 +351,7 @@ class DirectCommand:
     thrusts_N: Array | None = None
 
 
-@dataclass(frozen=True)
-class Directive:
+class Directive(Struct, frozen=True):
     """What guidance wants of one chaser.
 
     ``phase``: name of its phase. ``isolated``, ``trusted``: thrusters, by operator command.
@@ -400,8 +392,7 @@ class HorizonReference:
     box_clearance_m: Array | None = None
 
 
-@dataclass(frozen=True)
-class GuidanceResult:
+class GuidanceResult(Struct, frozen=True):
     """Result of guidance. ``directives``: one for every chaser of the mission, in order.
     ``horizon``: None if no chaser is planned for.
     """
@@ -473,8 +464,7 @@ class SolveStatus(NamedTuple):
     max_violation_m: float
 
 
-@dataclass(frozen=True)
-class ChaserPlanning:
+class ChaserPlanning(Struct, frozen=True):
     """Result of planning for one chaser.
 
     ``solve``: result of this tick's solve, None without one. ``flyable``: plan that may be flown;
@@ -488,8 +478,7 @@ class ChaserPlanning:
     certificate: PlanCertificate | None = None
 
 
-@dataclass(frozen=True)
-class PlanResult:
+class PlanResult(Struct, frozen=True):
     """Result of planning. ``chasers``: one for every chaser of the mission, in order. ``wall_s``:
     duration of the solve.
     """

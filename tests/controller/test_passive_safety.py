@@ -24,6 +24,7 @@ from chaserdock_protocol.scenario import (
     parse_scenario,
 )
 from general_position import attitude
+from msgspec import structs
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh, with_settings
 from nmpc_kernels import build_rows
 
@@ -294,7 +295,7 @@ def pushed(force_N: float, sigma_N: float, mass_kg: float = 30.0) -> TargetEstim
         disturbed(chaser.disturbed.covariance[:6, :6], sigma_N / mass_kg).covariance,
     )
     values = SimpleNamespace(
-        at_effect=found.at_effect, chasers=(replace(chaser, disturbed=motion),)
+        at_effect=found.at_effect, chasers=(structs.replace(chaser, disturbed=motion),)
     )
     return cast(TargetEstimation, values)
 

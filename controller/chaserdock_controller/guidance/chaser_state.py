@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import CameraCalibration, Level, Odometry
+from msgspec import Struct
 
 from chaserdock_controller.interfaces import PlanningFailure, RelativePose, TargetState
 
@@ -77,8 +78,7 @@ class Cause(NamedTuple):
     place_m: Array | None = None
 
 
-@dataclass(frozen=True)
-class ChaserTick:
+class ChaserTick(Struct, frozen=True):
     """What is known of one chaser in a tick.
 
     ``own``: its estimated state, None without odometry. ``invalid``: its odometry is not valid.

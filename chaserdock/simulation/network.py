@@ -52,10 +52,11 @@ def matches(expression: str, key: str) -> bool:
 
 @dataclass
 class _Subscription:
+    """A subscription. ``links``: from the publishers that know of it, by name."""
+
     owner: SimulatedConnection
     expression: str
     arrived: Callable[[RawSample], None]
-    known_to: set[str] = field(default_factory=set)
     links: dict[str, MessageLink] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -121,27 +122,14 @@ class SimulatedNetwork:
                 if subscription.records_all:
                     self.traffic.recorded[raw.key] += 1
                 subscription.arrived(raw)
-            elif sender.name in subscription.known_to:
-                self._send(sender, subscription, raw, qos, blocking)
+            elif (link := subscription.links.get(sender.name)) is not None:
+                arguments = (link, subscription, raw)
+                self.links.send(link, len(raw.payload), qos, blocking, self._arrive, arguments)
 
     def _route(self, key: str) -> list[_Subscription]:
         if key not in self._routes:
             self._routes[key] = [s for s in self._subscriptions if matches(s.expression, key)]
         return self._routes[key]
-
-    def _send(
-        self,
-        sender: SimulatedConnection,
-        to: _Subscription,
-        raw: RawSample,
-        qos: str,
-        blocking: bool,
-    ) -> None:
-        link = to.links.get(sender.name)
-        if link is None:
-            link = to.links[sender.name] = self.links.between(sender.name, to.owner.name)
-        size = len(raw.payload)
-        self.links.send(link, size, qos, blocking, self._arrive, (link, to, raw))
 
     def _arrive(self, link: MessageLink, to: _Subscription, raw: RawSample) -> None:
         """Hand a sample that has crossed a link to its subscriber."""
@@ -228,9 +216,12 @@ class SimulatedNetwork:
 
     def _declare(self, subscription: _Subscription, publisher: str) -> None:
         """Make a subscription known to a publisher when the declaration arrives there."""
-        self.links.deliver(
-            subscription.owner.name, publisher, lambda: subscription.known_to.add(publisher)
-        )
+        owner = subscription.owner.name
+
+        def arrive() -> None:
+            subscription.links[publisher] = self.links.between(publisher, owner)
+
+        self.links.deliver(owner, publisher, arrive)
 
     def ask(
         self,

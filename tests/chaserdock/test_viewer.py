@@ -18,11 +18,13 @@ import msgspec
 import numpy as np
 import pytest
 import viser
+from chaserdock_models import rotations
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     BodyTruth,
     CommandReply,
+    DockingStatus,
     Event,
     Image,
     MissionEnd,
@@ -60,6 +62,7 @@ from chaserdock.viewer.logged import LoggedMission
 from chaserdock.viewer.page import Timeline, with_age
 from chaserdock.viewer.player import advance
 from chaserdock.viewer.report_page import ReportPage
+from chaserdock.viewer.scene import VIEWS, SceneView, ViewFrom
 from chaserdock.viewer.server import page_server
 from chaserdock.viewer.snapshot import MissionState
 
@@ -186,6 +189,17 @@ def test_faults_are_listed(mission: LoggedMission) -> None:
         "chaser 0: fallback (brake)",
     ):
         assert text in listed
+
+
+def test_coasting_is_a_fault_except_at_a_port(mission: LoggedMission) -> None:
+    state = mission.at(1.0)
+    assert state.chasers[0].wrench is not None
+    coast = msgspec.structs.replace(state.chasers[0].wrench, mode="coast")
+    state.update(topics.WRENCH, coast)
+    assert "commands coast" in words.faults(state, mission.history, set())
+    at_port = DockingStatus(chaser=0, contact=True, armed=True, latched=True)
+    state.update(topics.DOCKING, at_port)
+    assert words.faults(state, mission.history, set()) == "none"
 
 
 # -- the past --------------------------------------------------------------------------------------
@@ -396,6 +410,43 @@ def test_time_line_plays_to_its_end_and_follows_the_slider() -> None:
     assert line.at_s == 10.0
     advance(line, 1.0)
     assert not line.playing
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_labels_move_with_the_picture_that_shows_their_bodies(
+    mission: LoggedMission, view: ViewFrom
+) -> None:
+    """No label has a parent that moves: viser would draw it where the parent was in the picture
+    before.
+    """
+    with page_server(DEFAULT_HOST, None, TOKEN) as server:
+        scene = SceneView(server, mission.scenario)
+        scene.view, state = view, mission.at(1.0)
+        scene.draw(state, mission.history, slow=True)
+        numbers = [server.scene.get_handle_by_name(f"/number_{i}") for i in (0, 1)]
+        target = state.true_target()
+        assert target is not None
+        for i in (0, 1):
+            chaser = state.chaser(i)
+            assert chaser is not None
+            up = np.array([0.0, 0.0, 0.75 * mission.scenario.chaser.size_m[2]])
+            above = chaser.position_m + rotations.rotate(chaser.q_wxyz, up)
+            beside = above - target.position_m
+            expected = {
+                "the world": above,
+                "beside the target": beside,
+                "on the target": rotations.rotate_inverse(target.q_wxyz, beside),
+            }[view]
+            label = numbers[i]
+            assert label is not None
+            assert label.visible
+            assert label.position == pytest.approx(expected)
+        radius = server.scene.get_handle_by_name("/radius_1")
+        assert radius is not None
+        assert radius.visible
+        scene.show_scale(False)
+        scene.draw(state, mission.history, slow=True)
+        assert not radius.visible
 
 
 # -- shapes ----------------------------------------------------------------------------------------

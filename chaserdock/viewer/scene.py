@@ -50,8 +50,14 @@ _RING_RGB = (96, 104, 116)
 """Colour (0 to 255) of the rings: grey, darker than the faint lines of chasers. Brighter: they hide
 paths.
 """
-_STARS_M = 100.0
-"""Distance of the stars, m: far outside the scene."""
+_STARS_M, _STARS_REACH = 100.0, 20.0
+"""Least distance (m) of the stars, and over the size of the scene: far outside of it."""
+_BESIDE_EARTH_RAD = 0.25
+"""Angle (rad) of the first view from the edge of the Earth: half of half a picture. Larger: the
+Earth leaves it; smaller: it fills it.
+"""
+_FIRST_VIEW = np.array([-0.55, -0.85, 0.55])
+"""Direction from the target to the first view: from behind and above chaser 0."""
 _IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
@@ -80,6 +86,8 @@ class SceneView:
         self._root = scene.add_frame("/scene", show_axes=False)
         self._root_pose = _IDENTITY
         self._reach_m = max(math.hypot(*c.position_m) for c in scenario.chasers)
+        self._stars_m = max(_STARS_M, _STARS_REACH * self._reach_m)
+        self._disc = _earth_disc(scenario)
         self._add_space()
         self._add_scale()
 
@@ -148,9 +156,25 @@ class SceneView:
                 )
 
         self.view: ViewFrom = VIEWS[0]
-        far = 2.0 * self._reach_m
-        server.initial_camera.position = (-0.55 * far, -0.85 * far, 0.55 * far)
+        x, y, z = 2.0 * self._reach_m * self._first_view()
+        server.initial_camera.position = (x, y, z)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
+        server.initial_camera.far = 10.0 * self._stars_m
+        server.initial_camera.near = 1e-5 * server.initial_camera.far
+
+    def _first_view(self) -> Array:
+        """Return the direction (3,) from the target to the first view; the edge of an Earth is
+        in the picture.
+        """
+        if self._disc is None:
+            return _FIRST_VIEW
+        towards, radius_rad = self._disc
+        axis = np.array(towards) / np.linalg.norm(towards)
+        turns = np.arange(0.0, 2.0 * math.pi, math.pi / 8.0)
+        views = [rotations.rotate(rotations.exp([0.0, 0.0, turn]), _FIRST_VIEW) for turn in turns]
+        away_rad = [math.acos(-view @ axis / np.linalg.norm(view)) for view in views]
+        wanted_rad = radius_rad + _BESIDE_EARTH_RAD
+        return views[int(np.argmin(np.abs(np.array(away_rad) - wanted_rad)))]
 
     def _add_space(self) -> None:
         """Add the stars and the Earth of the simulated images, on black whatever the theme of the
@@ -158,8 +182,8 @@ class SceneView:
         """
         self._scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
         directions, levels = star_field()
-        if (disc := _earth_disc(self._scenario)) is not None:
-            towards, radius_rad = disc
+        if self._disc is not None:
+            towards, radius_rad = self._disc
             axis = np.array(towards) / np.linalg.norm(towards)
             sun = np.array(to_sun(cast("Scenario", self._scenario)))
             self._body("/scene/earth", shapes.earth(axis, radius_rad, sun, self._reach_m))
@@ -167,10 +191,11 @@ class SceneView:
             directions, levels = directions[beside], levels[beside]
         self._scene.add_point_cloud(
             "/scene/stars",
-            (_STARS_M * directions).astype(np.float32),
+            (self._stars_m * directions).astype(np.float32),
             np.repeat(levels[:, None], 3, axis=1),
-            point_size=0.0015 * _STARS_M,
+            point_size=0.0015 * self._stars_m,
             point_shape="circle",
+            precision="float32",
         )
 
     def _add_scale(self) -> None:
@@ -278,9 +303,11 @@ class SceneView:
         return Pose(self._on_screen(over), _IDENTITY.q_wxyz)
 
     def _place_radii(self, target_m: Array) -> None:
-        """Place the radii of the rings beside these. ``target_m`` (3,): WRF."""
+        """Place the radii of the rings at their nearest points. ``target_m`` (3,): WRF."""
+        near = self._first_view() * [1.0, 1.0, 0.0]
+        near /= np.linalg.norm(near)
         for radius_m, label in self._radii.items():
-            label.position = self._on_screen(target_m - np.array([0.0, radius_m, 0.0]))
+            label.position = self._on_screen(target_m + radius_m * near)
             label.visible = self._rings.visible
 
     def _place(self, node: Any, pose: Pose | None) -> None:

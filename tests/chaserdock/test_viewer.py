@@ -36,6 +36,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.transport import Link, Node
+from chaserdock_world.orbit import earth_disc
 from harness import ROOT, chaserdock, finished
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -489,6 +490,29 @@ def test_the_earth_fills_its_disc_outside_the_scene() -> None:
     assert np.all(np.einsum("ij,ij->i", normals, three[:, 0]) <= 1e-9)
     night = shapes.earth(axis, radius_rad, axis, reach_m)
     assert mesh.colours.mean() > 5.0 * night.colours.mean() > 0.0
+
+
+@pytest.mark.parametrize("name", ["v-bar", "low-orbit", "harsh-light", "markerless-docking"])
+def test_the_first_view_shows_the_edge_of_the_earth(name: str) -> None:
+    """With stars and Earth within its range, and the stars outside the scene."""
+    scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml")
+    disc = earth_disc(scenario)
+    assert disc is not None
+    towards, radius_rad = disc
+    with page_server(DEFAULT_HOST, None, TOKEN) as server:
+        SceneView(server, scenario)
+        camera = server.initial_camera
+        stars = server.scene.get_handle_by_name("/scene/stars")
+        assert isinstance(stars, viser.PointCloudHandle)
+        stars_m = np.linalg.norm(stars.points, axis=1)
+    ahead = -camera.position / np.linalg.norm(camera.position)
+    reach_m = max(float(np.linalg.norm(c.position_m)) for c in scenario.chasers)
+    earth = shapes.earth(np.array(towards), radius_rad, np.array(towards), reach_m)
+    earth_m = np.linalg.norm(earth.vertices_m, axis=1)
+    from_edge_rad = np.arccos(ahead @ towards / np.linalg.norm(towards)) - radius_rad
+    assert 0.1 < from_edge_rad < 0.4
+    assert stars_m.min() > 5.0 * np.linalg.norm(camera.position)
+    assert camera.far > 1.2 * max(stars_m.max(), earth_m.max())
 
 
 def test_corridor_covers_the_allowed_region() -> None:

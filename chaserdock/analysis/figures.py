@@ -96,9 +96,9 @@ def flown(flight: RecordedFlight) -> list[int]:
     return numbers
 
 
-def _span_s(times_s: Array) -> tuple[float, float]:
-    """Return the limits of a time axis, from zero; the interval is not empty."""
-    return 0.0, max(float(times_s[-1]), 1e-3)
+def _span_s(*times_s: Array) -> tuple[float, float]:
+    """Return the limits of a time axis, from zero to the last of all times; not empty."""
+    return 0.0, max(1e-3, *(float(times[-1]) for times in times_s if len(times)))
 
 
 def _path(own: Track, target: Track) -> tuple[Array, Array]:
@@ -389,9 +389,8 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
         if flight.motion.source == "reference":
             sigma = flight.motion.sigmas()[row] * factor
             limit_line(whole, max(sigma, 1e-4), "reference, 1 sigma")
-    last_s = max(float(time_s[-1]) for time_s, *_ in errors.values() if len(time_s))
     for axes in panels[:2]:
-        axes.set_xlim(_span_s(np.array([last_s])))
+        axes.set_xlim(_span_s(*(time_s for time_s, *_ in errors.values())))
     _name_chasers(flight, panels[0])
     return figure
 
@@ -621,7 +620,7 @@ def passive_safety(flight: RecordedFlight, _: Traces) -> Figure:
     least = flight.scenario.limits.estimate_margin_sigmas
     limit_line(axes, least, f"limit {least:g}")
     axes.set(xlabel="time / s", ylabel="margin / sigmas", yscale="symlog")
-    axes.set_xlim(0.0, max(float(h.time_s[-1]) for h in flight.safety.values()))
+    axes.set_xlim(_span_s(*(history.time_s for history in flight.safety.values())))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     legend_above(axes)
     return figure
@@ -695,7 +694,7 @@ def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     for column, (label, factor, limit, _) in enumerate(kinds):
         axes[column].set_ylim(-reach[column], reach[column])
         axes[column].set_title(f"limit {limit * factor:g} {label.partition(' / ')[2]}")
-    axes[0].set_xlim(0, max(float(t.edges_s[-1]) for t in traces.inputs.values()))
+    axes[0].set_xlim(_span_s(*(t.edges_s for t in traces.inputs.values())))
     for a in axes[-2:]:
         a.set_xlabel("time / s")
     legend_above(axes[1])
@@ -720,7 +719,7 @@ def effort(flight: RecordedFlight, traces: Traces) -> Figure:
     scale = (lambda v: v / mass_kg, lambda v: v * mass_kg)
     right = axes.secondary_yaxis("right", functions=scale)
     right.set_ylabel("velocity change / m s⁻¹")
-    axes.set_xlim(0.0, max(float(t.edges_s[-1]) for t in traces.inputs.values()))
+    axes.set_xlim(_span_s(*(t.edges_s for t in traces.inputs.values())))
     _name_chasers(flight, axes)
     return figure
 
@@ -944,8 +943,8 @@ def innovations(flight: RecordedFlight, _: Traces) -> Figure:
     axes.axhspan(low, high, color=GOOD, alpha=0.15, linewidth=0)
     axes.axhline(1.0, color=GOOD, linewidth=0.8)
     _plain_numbers(axes.yaxis)
-    last_s = max(float(history.time_s[-1]) for history in flight.innovations.values())
-    axes.set(ylabel="NIS per degree of freedom", xlabel="time / s", xlim=(0.0, max(last_s, 1e-3)))
+    axes.set(ylabel="NIS per degree of freedom", xlabel="time / s")
+    axes.set_xlim(_span_s(*(history.time_s for history in flight.innovations.values())))
     legend_above(axes)
     return figure
 

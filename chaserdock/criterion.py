@@ -80,7 +80,7 @@ class Criterion(Struct, frozen=True, kw_only=True, omit_defaults=True):
         if number is None:
             return _DASH
         if self.unit in ("", "s"):
-            return f"{number:.{2 if self.unit else 0}f} {self.unit}".rstrip()
+            return f"{number:z.{2 if self.unit else 0}f} {self.unit}".rstrip()
         return quantity(number, self.unit)
 
     @property

@@ -111,7 +111,8 @@ def diagram(
     high = max(b.y + b.height / 2 for b in boxes.values()) + margin
     size = ((right - left) * cell[0], (high - low) * cell[1])
     with styled(name):
-        figure = Figure(figsize=size, layout="none")
+        figure = Figure(figsize=size)
+        figure.set_layout_engine("none")
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set(xlim=(left * cell[0], right * cell[0]), ylim=(low * cell[1], high * cell[1]))
         axes.axis("off")
@@ -439,7 +440,8 @@ def laboratory() -> None:
 def frames() -> None:
     """World, chaser, target and image frame."""
     with styled("frames"):
-        figure = Figure(figsize=(7.0, 3.6), layout="none")
+        figure = Figure(figsize=(7.0, 3.6))
+        figure.set_layout_engine("none")
         axes: Any = figure.add_axes((-0.2, -0.8, 1.4, 2.6), projection="3d", computed_zorder=False)
         q_target = rotations.exp([0.2, -0.25, 0.5])
         q_chaser = rotations.exp([0.0, 0.0, 0.15])
@@ -935,7 +937,7 @@ PICTURES: dict[str, Callable[[], None]] = {
 
 def main() -> None:
     global logs
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PICTURES)}")
     parser.add_argument("--logs", type=Path, default=logs, help="folder of the flights")
     options = parser.parse_args()

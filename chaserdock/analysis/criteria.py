@@ -341,6 +341,8 @@ def judge(result: dict[str, Any], s: Scenario, skipped: Sequence[str] = ()) -> l
         if key is not None:
             used.add(key)
             row = structs.replace(row, outcome="not judged", measured=None, note=reasons[key])
+            if row.unit == "s":  # the end of a flight that is too short
+                row = structs.replace(row, limit=None)
         rows.append(row)
     for what, why in reasons.items():
         if what not in used:

@@ -96,9 +96,9 @@ def flown(flight: RecordedFlight) -> list[int]:
     return numbers
 
 
-def _span_s(times_s: Array) -> tuple[float, float]:
-    """Return the limits of a time axis, from zero; the interval is not empty."""
-    return 0.0, max(float(times_s[-1]), 1e-3)
+def _span_s(*times_s: Array) -> tuple[float, float]:
+    """Return the limits of a time axis, from zero to the last of all times; not empty."""
+    return 0.0, max(1e-3, *(float(times[-1]) for times in times_s if len(times)))
 
 
 def _path(own: Track, target: Track) -> tuple[Array, Array]:
@@ -119,6 +119,8 @@ def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
     target = flight.motion[TARGET]
     paths = {i: _path(*flight.motion.pair(i)) for i in numbers}
     figure = Figure(figsize=(9.6, 4.8))
+    layout: Any = figure.get_layout_engine()
+    layout.set(rect=(0.0, 0.0, 0.96, 1.0))  # it does not know the labels of 3-D axes
     for place, title in enumerate(
         ("World frame (WRF)", "Relative to the target, target frame (TRF)")
     ):
@@ -140,21 +142,21 @@ def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
         axes.set_title(title)
         axes.set(xlabel="x / m", ylabel="y / m", zlabel="z / m")
         axes.xaxis.labelpad = axes.yaxis.labelpad = 7.0
-        _equal_scale(
+        lengths = _equal_scale(
             axes, [paths[i][place] for i in numbers] + ([] if place else [target.position_m])
         )
-        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        for axis, length in zip((axes.xaxis, axes.yaxis, axes.zaxis), lengths, strict=True):
             axis.pane.set_visible(False)
-            axis.set_major_locator(MaxNLocator(5))
+            axis.set_major_locator(MaxNLocator(5 if length > 0.5 * max(lengths) else 2))
         axes.tick_params(labelsize=7.5)
         if not place:
             axes.legend(loc="upper left", bbox_to_anchor=(-0.12, 1.0))
     return figure
 
 
-def _equal_scale(axes: Any, paths: list[Array]) -> None:
+def _equal_scale(axes: Any, paths: list[Array]) -> Array:
     """Give the axes one scale and limits around the paths and the origin; the box is no larger than
-    the paths need.
+    the paths need. Return the lengths (3,) of its sides, m.
     """
     points = np.concatenate([*paths, np.zeros((1, 3))])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -165,6 +167,7 @@ def _equal_scale(axes: Any, paths: list[Array]) -> None:
     ):
         set_limits(m - h, m + h)
     axes.set_box_aspect(half, zoom=1.0)
+    return 2.0 * half
 
 
 _STRIP_ROW_IN = 0.17
@@ -216,12 +219,12 @@ def _draw_phases(strip: Axes, flight: RecordedFlight, width_in: float, named: bo
                 )
         if named:
             place = strip.get_yaxis_transform()
-            text = f"chaser {i} "
-            strip.text(
-                0.0,
-                row,
-                text,
-                transform=place,
+            strip.annotate(
+                f"chaser {i}",
+                (0.0, row),
+                xycoords=place,
+                xytext=(-4, 0),
+                textcoords="offset points",
                 ha="right",
                 va="center",
                 fontsize=8,
@@ -332,6 +335,12 @@ def stack(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+_PASSAGES = 0.02
+"""Share of the values below a logarithmic scale: starts on the reference and passages through it.
+Larger: the least errors are cut off; smaller: a scale with decades that hold no more than these.
+"""
+
+
 @_figure(
     "Tracking errors",
     "Distance and angle of each chaser from its reference pose on the true target; without ground "
@@ -360,9 +369,11 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
             for axes, shown in ((whole, np.maximum(values[d], 1e-4)), (late, values[d])):
                 axes.plot(time_s[d], shown, color=colour(i), label=f"chaser {i}")
             reach = max(reach, _span_of(values, time_s, s.settling_s))
-            least = min(least, float(np.median(values))) if len(values) else least
-        # A start on the reference, and passages through it, do not set the scale.
-        whole.set(yscale="log", ylabel=label, ylim=(max(0.05 * least, 1e-4), None))
+            if len(values):
+                least = min(least, 0.5 * float(np.quantile(values, _PASSAGES)))
+        if limit is not None:
+            least = min(least, 0.7 * limit)
+        whole.set(yscale="log", ylabel=label, ylim=(max(least, 1e-4), None))
         late.set_ylabel(label)
         _plain_numbers(whole.yaxis)
         late.set_ylim(0.0, 1.15 * reach)
@@ -378,9 +389,8 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
         if flight.motion.source == "reference":
             sigma = flight.motion.sigmas()[row] * factor
             limit_line(whole, max(sigma, 1e-4), "reference, 1 sigma")
-    last_s = max(float(time_s[-1]) for time_s, *_ in errors.values() if len(time_s))
     for axes in panels[:2]:
-        axes.set_xlim(_span_s(np.array([last_s])))
+        axes.set_xlim(_span_s(*(time_s for time_s, *_ in errors.values())))
     _name_chasers(flight, panels[0])
     return figure
 
@@ -412,7 +422,7 @@ def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
         axes[3 * row].set_ylabel(label)
         axes[3 * row].set_ylim(-reach[row], reach[row])
     for k, name in enumerate("xyz"):
-        axes[k].annotate(name, (0.03, 0.95), xycoords="axes fraction", va="top", weight="bold")
+        axes[k].set_title(name)
         axes[3 + k].set_xlabel("time / s")
     axes[0].set_xlim(_span_s(flight.motion[TARGET].time_s))
     figure.legend(
@@ -483,6 +493,7 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
         if n > 2:
             speed = -np.gradient(distance, time_s)
             bottom.plot(time_s[d], speed[d] * 1e3, color=colour(i), linestyle=dashes(i))
+            fastest = max(fastest, 0.55e3 * _span_of(speed, time_s, s.settling_s))
         for begin_s, end_s, limit in speed_limits(flight, i):
             bottom.plot(
                 (begin_s, end_s), (limit * 1e3,) * 2, color=colour(i), linestyle=":", linewidth=1.3
@@ -609,6 +620,8 @@ def passive_safety(flight: RecordedFlight, _: Traces) -> Figure:
     least = flight.scenario.limits.estimate_margin_sigmas
     limit_line(axes, least, f"limit {least:g}")
     axes.set(xlabel="time / s", ylabel="margin / sigmas", yscale="symlog")
+    axes.set_xlim(_span_s(*(history.time_s for history in flight.safety.values())))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     legend_above(axes)
     return figure
 
@@ -681,7 +694,7 @@ def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     for column, (label, factor, limit, _) in enumerate(kinds):
         axes[column].set_ylim(-reach[column], reach[column])
         axes[column].set_title(f"limit {limit * factor:g} {label.partition(' / ')[2]}")
-    axes[0].set_xlim(0, max(float(t.edges_s[-1]) for t in traces.inputs.values()))
+    axes[0].set_xlim(_span_s(*(t.edges_s for t in traces.inputs.values())))
     for a in axes[-2:]:
         a.set_xlabel("time / s")
     legend_above(axes[1])
@@ -706,7 +719,7 @@ def effort(flight: RecordedFlight, traces: Traces) -> Figure:
     scale = (lambda v: v / mass_kg, lambda v: v * mass_kg)
     right = axes.secondary_yaxis("right", functions=scale)
     right.set_ylabel("velocity change / m s⁻¹")
-    axes.set_xlim(0.0, max(float(t.edges_s[-1]) for t in traces.inputs.values()))
+    axes.set_xlim(_span_s(*(t.edges_s for t in traces.inputs.values())))
     _name_chasers(flight, axes)
     return figure
 
@@ -930,8 +943,8 @@ def innovations(flight: RecordedFlight, _: Traces) -> Figure:
     axes.axhspan(low, high, color=GOOD, alpha=0.15, linewidth=0)
     axes.axhline(1.0, color=GOOD, linewidth=0.8)
     _plain_numbers(axes.yaxis)
-    last_s = max(float(history.time_s[-1]) for history in flight.innovations.values())
-    axes.set(ylabel="NIS per degree of freedom", xlabel="time / s", xlim=(0.0, max(last_s, 1e-3)))
+    axes.set(ylabel="NIS per degree of freedom", xlabel="time / s")
+    axes.set_xlim(_span_s(*(history.time_s for history in flight.innovations.values())))
     legend_above(axes)
     return figure
 
@@ -978,7 +991,8 @@ def cameras(flight: RecordedFlight, traces: Traces) -> Figure:
     top.invert_yaxis()
     top.grid(False)
     legend_above(top)
-    bottom.set(ylabel="markers used", xlabel="time / s", ylim=(-0.2, None))
+    most = max((int(s.markers.max()) for s in flight.sightings.values()), default=0)
+    bottom.set(ylabel="markers used", xlabel="time / s", ylim=(-0.2, 1.1 * max(most, 1)))
     bottom.yaxis.set_major_locator(MaxNLocator(integer=True))
     if bottom.get_legend_handles_labels()[0]:
         legend_above(bottom)

@@ -84,7 +84,7 @@ def property_rows(
         off = (
             missing
             if true is None or not sigma[k]
-            else f"{(target[k] - true[k]) / sigma[k]:+.1f} sigma"
+            else f"{(target[k] - true[k]) / sigma[k]:+z.1f} sigma"
         )
         learnt_below = _LEARNT_SHARE * prior[k]
         rows.append(
@@ -108,5 +108,5 @@ def _with_sigma(value: float, sigma: float, scale: float, learnt_below: float) -
     """
     shown = sigma * scale
     digits = 0 if shown <= 0.0 else max(0, 1 - int(np.floor(np.log10(shown))))
-    text = f"{value * scale:.{digits}f} ± {shown:.{digits}f}"
+    text = f"{value * scale:z.{digits}f} ± {shown:.{digits}f}"
     return text if sigma < learnt_below else f"{text} {PRIOR_ONLY}"

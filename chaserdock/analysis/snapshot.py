@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from chaserdock_agents.chaser.sighting import BadImage, decode_image
+from chaserdock_protocol import pose_image
 from chaserdock_protocol.messages import Image, Sighting
 from chaserdock_protocol.recording.log import LogError, logged_scenario
 from chaserdock_protocol.scenario import FlightScenario
@@ -26,6 +27,9 @@ _LABEL_PX, _LABEL_DIM = 26, 0.3
 """Height (px) of the strip behind the label, and by what factor it is darkened: the label is white,
 and so are markers.
 """
+
+_NO_PICTURE = 6
+"""Grey level (0 to 255) of an image without a picture. Larger: it passes for a lit scene."""
 
 
 def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
@@ -56,8 +60,8 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
 def annotated_image(
     scenario: FlightScenario, image: Image, sighting: Sighting | None, width_px: int
 ) -> NDArray[np.uint8]:
-    """Return the image as BGR, ``width_px`` wide, with the sighting's markers and pose. Raise
-    LogError for a bad image.
+    """Return the image as BGR, ``width_px`` wide, with the sighting's markers and pose: dark if it
+    holds a pose in place of a picture. Raise LogError for a bad image.
     """
     try:
         grey = decode_image(image)
@@ -65,21 +69,26 @@ def annotated_image(
         raise LogError(
             f"image of chaser {image.chaser} at {image.sim_time_ns / 1e9:.2f} s: {error}"
         ) from None
+    camera = scenario.camera_model()
+    is_pose = scenario.perception.name == pose_image.NAME
+    if is_pose:
+        grey = np.full((camera.height_px, camera.width_px), _NO_PICTURE, np.uint8)
     # A gamma correction for display makes the shaded side visible.
     gamma = np.array([255 * (v / 255) ** 0.6 for v in range(256)]).astype(np.uint8)
     canvas: Any = cv2.cvtColor(cv2.LUT(grey, gamma), cv2.COLOR_GRAY2BGR)
-    scale = width_px / image.width_px
+    scale = width_px / grey.shape[1]
     canvas = cv2.resize(
-        canvas, (width_px, round(image.height_px * scale)), interpolation=cv2.INTER_AREA
+        canvas, (width_px, round(grey.shape[0] * scale)), interpolation=cv2.INTER_AREA
     )
     if sighting is not None and sighting.sim_time_ns == image.sim_time_ns:
-        corners = (np.reshape(sighting.corners_px, (-1, 4, 2)) + 0.5) * scale - 0.5
-        draw_markers(canvas, corners)
+        if not is_pose:
+            corners = (np.reshape(sighting.corners_px, (-1, 4, 2)) + 0.5) * scale - 0.5
+            draw_markers(canvas, corners)
         if sighting.solutions:
             best = sighting.solutions[0]
-            camera = scenario.camera_model()
             draw_axes(canvas, camera, best.position_m, best.q_wxyz, _AXIS_M, scale)
-    text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  {seen_text(sighting)}"
+    text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  "
+    text += "pose, no picture" if is_pose else seen_text(sighting)
     (length_px, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
     size = 0.5 * min(1.0, (width_px - 16) / length_px)  # fit the text into a small image
     canvas[:_LABEL_PX] = (_LABEL_DIM * canvas[:_LABEL_PX]).astype(np.uint8)

@@ -48,7 +48,8 @@ _OLD_RGB = (255, 176, 0)
 """Colour of the age of an old image: that of warnings, on dark images."""
 _LEFT_PX, _RIGHT_PX = 380, 370
 """Widths (px) of the panels. Larger: less of the scene on a screen of 1280 pixels."""
-_PHONE = """<style>
+_STYLE = """<style>
+.mantine-Paper-root td, .mantine-Paper-root th { padding: 0.1em 0.4em 0.1em 0; }
 @media (max-width: 36em) {
   div:has(> .mantine-Paper-root[style*="max-height: 60%"]) { flex-direction: column; }
   div:has(> .mantine-Paper-root[style*="max-height: 60%"]) > div[style*="flex-grow: 1"] {
@@ -62,8 +63,9 @@ _PHONE = """<style>
   }
 }
 </style>"""
-"""On a narrow screen: the panel of viser 1.1 below the scene, not over its lower part. The width is
-that from which viser replaces its docks by one panel; a test measures the places.
+"""Space between the columns of tables. On a narrow screen: the panel of viser 1.1 below the scene,
+not over its lower part. The width is that from which viser replaces its docks by one panel; a test
+measures the places.
 """
 _DECADES = [10.0**k for k in range(-3, 7)]
 _GRID = {"stroke": "rgba(128,128,128,0.25)", "width": 1}
@@ -160,10 +162,11 @@ class Page:
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_RIGHT_PX)
-        gui.add_html(_PHONE)
+        gui.add_html(_STYLE)
         self._head = gui.add_markdown("waiting for the first tick")
         if self._timeline is not None:
             self._time_line(self._timeline)
+        self._criteria = gui.add_markdown("")
         self._table = gui.add_markdown("")
         self._mass: Any = None
         if self._scenario.detumble.identification.enabled:
@@ -357,6 +360,7 @@ class Page:
         for element, content in (
             *mass,
             (self._head, text.head(self._scenario, state, mode, speed, verdict, self._report)),
+            (self._criteria, text.criteria(verdict)),
             (self._table, text.chasers(state, history)),
             (self._faults, text.faults(state, history, lost)),
             (

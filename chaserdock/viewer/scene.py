@@ -12,6 +12,7 @@ import numpy as np
 import trimesh
 import viser
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario import FlightScenario, Scenario
 from chaserdock_world.orbit import earth_disc, to_sun
 from chaserdock_world.rendering.background import star_field
@@ -49,8 +50,14 @@ _RING_RGB = (96, 104, 116)
 """Colour (0 to 255) of the rings: grey, darker than the faint lines of chasers. Brighter: they hide
 paths.
 """
-_STARS_M = 100.0
-"""Distance of the stars, m: far outside the scene."""
+_STARS_M, _STARS_REACH = 100.0, 20.0
+"""Least distance (m) of the stars, and over the size of the scene: far outside of it."""
+_BESIDE_EARTH_RAD = 0.25
+"""Angle (rad) of the first view from the edge of the Earth: half of half a picture. Larger: the
+Earth leaves it; smaller: it fills it.
+"""
+_FIRST_VIEW = np.array([-0.55, -0.85, 0.55])
+"""Direction from the target to the first view: from behind and above chaser 0."""
 _IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
@@ -77,7 +84,10 @@ class SceneView:
         self._scene = scene = server.scene
         scene.configure_default_lights(cast_shadow=False)
         self._root = scene.add_frame("/scene", show_axes=False)
+        self._root_pose = _IDENTITY
         self._reach_m = max(math.hypot(*c.position_m) for c in scenario.chasers)
+        self._stars_m = max(_STARS_M, _STARS_REACH * self._reach_m)
+        self._disc = _earth_disc(scenario)
         self._add_space()
         self._add_scale()
 
@@ -95,6 +105,7 @@ class SceneView:
         self._keep_out.visible = False
 
         self._chasers: list[Any] = []
+        self._numbers: list[Any] = []
         self._plans: list[Any] = []
         self._references: list[Any] = []
         self._trails: list[Any] = []
@@ -107,9 +118,7 @@ class SceneView:
             colour = _rgb(COLOURS[i % len(COLOURS)])
             name = f"/scene/chaser_{i}"
             self._chasers.append(self._body(name, shapes.mesh_of(chaser_body(scenario, i))))
-            scene.add_label(
-                f"{name}/name", str(i), position=(0.0, 0.0, 0.75 * scenario.chaser.size_m[2])
-            )
+            self._numbers.append(self._label(f"/number_{i}", str(i)))
 
             self._frustums.append(
                 scene.add_camera_frustum(
@@ -147,9 +156,25 @@ class SceneView:
                 )
 
         self.view: ViewFrom = VIEWS[0]
-        far = 2.0 * self._reach_m
-        server.initial_camera.position = (-0.55 * far, -0.85 * far, 0.55 * far)
+        x, y, z = 2.0 * self._reach_m * self._first_view()
+        server.initial_camera.position = (x, y, z)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
+        server.initial_camera.far = 10.0 * self._stars_m
+        server.initial_camera.near = 1e-5 * server.initial_camera.far
+
+    def _first_view(self) -> Array:
+        """Return the direction (3,) from the target to the first view; the edge of an Earth is
+        in the picture.
+        """
+        if self._disc is None:
+            return _FIRST_VIEW
+        towards, radius_rad = self._disc
+        axis = np.array(towards) / np.linalg.norm(towards)
+        turns = np.arange(0.0, 2.0 * math.pi, math.pi / 8.0)
+        views = [rotations.rotate(rotations.exp([0.0, 0.0, turn]), _FIRST_VIEW) for turn in turns]
+        away_rad = [math.acos(-view @ axis / np.linalg.norm(view)) for view in views]
+        wanted_rad = radius_rad + _BESIDE_EARTH_RAD
+        return views[int(np.argmin(np.abs(np.array(away_rad) - wanted_rad)))]
 
     def _add_space(self) -> None:
         """Add the stars and the Earth of the simulated images, on black whatever the theme of the
@@ -157,8 +182,8 @@ class SceneView:
         """
         self._scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
         directions, levels = star_field()
-        if (disc := _earth_disc(self._scenario)) is not None:
-            towards, radius_rad = disc
+        if self._disc is not None:
+            towards, radius_rad = self._disc
             axis = np.array(towards) / np.linalg.norm(towards)
             sun = np.array(to_sun(cast("Scenario", self._scenario)))
             self._body("/scene/earth", shapes.earth(axis, radius_rad, sun, self._reach_m))
@@ -166,25 +191,32 @@ class SceneView:
             directions, levels = directions[beside], levels[beside]
         self._scene.add_point_cloud(
             "/scene/stars",
-            (_STARS_M * directions).astype(np.float32),
+            (self._stars_m * directions).astype(np.float32),
             np.repeat(levels[:, None], 3, axis=1),
-            point_size=0.0015 * _STARS_M,
+            point_size=0.0015 * self._stars_m,
             point_shape="circle",
+            precision="float32",
         )
 
     def _add_scale(self) -> None:
         """Add rings around the target, in the plane z = 0 of WRF, with their radii."""
         self._rings = self._scene.add_frame("/scene/rings", show_axes=False)
+        self._radii: dict[float, Any] = {}
         for radius_m in shapes.scale_of(self._reach_m):
-            name = f"/scene/rings/{radius_m:g}"
-            self._lines(name, shapes.ring(radius_m), _RING_RGB, 1.0)
-            self._scene.add_label(
-                f"{name}/label", f"{radius_m:g} m", position=(0.0, -radius_m, 0.0)
-            )
+            name = f"{radius_m:g}"
+            self._lines(f"/scene/rings/{name}", shapes.ring(radius_m), _RING_RGB, 1.0)
+            self._radii[radius_m] = self._label(f"/radius_{name}", f"{name} m")
+
+    def _label(self, name: str, text: str) -> Any:
+        """Add a label, which follows no other node: viser draws one at its parent's pose in the
+        picture before, and draws no other picture until something changes.
+        """
+        return self._scene.add_label(name, text, visible=False)
 
     def show_scale(self, shown: bool) -> None:
         """Show or hide the rings."""
-        self._rings.visible = shown
+        for node in (self._rings, *self._radii.values()):
+            node.visible = shown
 
     def _body(self, name: str, mesh: shapes.Mesh) -> Any:
         solid = trimesh.Trimesh(
@@ -221,14 +253,17 @@ class SceneView:
         shown = true or estimate
         self._place(self._target, shown)
         self._place(self._estimate, estimate)
+        self._fix_frame(shown or _IDENTITY)
         if shown is not None:
             self._rings.position = shown.position_m
-        self._fix_frame(shown or _IDENTITY)
+            self._place_radii(shown.position_m)
         keep_out_m = state.keep_out_m(self._scenario.limits.min_distance_target_m)
         if keep_out_m != self._keep_out_m:
             self._keep_out_m, self._keep_out.points = keep_out_m, shapes.sphere(keep_out_m)
         for i, chaser in enumerate(state.chasers):
-            self._place(self._chasers[i], state.chaser(i))
+            pose = state.chaser(i)
+            self._place(self._chasers[i], pose)
+            self._place(self._numbers[i], None if pose is None else self._above(pose))
             away = chaser.error()
             apart = away is not None and (away[0] > _REFERENCE_M or away[1] > _REFERENCE_RAD)
             reference = pose_of(chaser.reference) if chaser.reference and apart else None
@@ -254,6 +289,26 @@ class SceneView:
         else:
             q, p = _IDENTITY.q_wxyz, -target.position_m
         self._root.position, self._root.wxyz = p, q
+        self._root_pose = Pose(p, q)
+
+    def _on_screen(self, point_m: Array) -> Array:
+        """Return a point (3,) of WRF in the frame that is fixed on the screen."""
+        root = self._root_pose
+        return root.position_m + rotations.rotate(root.q_wxyz, point_m)
+
+    def _above(self, chaser: Pose) -> Pose:
+        """Return where the number of a chaser stands."""
+        up = np.array([0.0, 0.0, 0.75 * self._scenario.chaser.size_m[2]])
+        over = chaser.position_m + rotations.rotate(chaser.q_wxyz, up)
+        return Pose(self._on_screen(over), _IDENTITY.q_wxyz)
+
+    def _place_radii(self, target_m: Array) -> None:
+        """Place the radii of the rings at their nearest points. ``target_m`` (3,): WRF."""
+        near = self._first_view() * [1.0, 1.0, 0.0]
+        near /= np.linalg.norm(near)
+        for radius_m, label in self._radii.items():
+            label.position = self._on_screen(target_m + radius_m * near)
+            label.visible = self._rings.visible
 
     def _place(self, node: Any, pose: Pose | None) -> None:
         if node.visible != (pose is not None):

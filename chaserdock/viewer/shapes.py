@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import centre_offset
@@ -30,6 +30,10 @@ _CAP = (24, 72)
 """Rings and sides of the drawn Earth. Larger: rounder limb, more triangles."""
 _SEA_RGB, _CLOUD_RGB = (38.0, 82.0, 150.0), (225.0, 232.0, 240.0)
 """Colours (0 to 255) of the Earth in sunlight, chosen. Brighter sea: bodies stand out less."""
+_WAVES, _WAVE_RAD = 24, 5.0
+"""Number of waves of clouds, and their phase (rad) from the middle to the horizon. More of it:
+smaller clouds.
+"""
 _NIGHT = 0.06
 """Brightness of the Earth's night side, so that its disc is seen before black space."""
 _SIDES = 24
@@ -160,24 +164,17 @@ def earth(direction: Array, radius_rad: float, to_sun: Array, reach_m: float) ->
     halves = np.stack([np.stack([a, b + sides, a + sides]), np.stack([a, b, b + sides])])
     triangles = halves.transpose(0, 2, 3, 1).reshape(-1, 3)
 
+    # Clouds are waves through space: noise on rings and sides would converge in the middle.
     noise = np.random.default_rng(0)
-    clouds = np.zeros((rings, sides))
-    for k in range(3):
-        clouds += 0.6**k * _stretched(noise.standard_normal((3 << k, 6 << k)), (rings, sides))
-    share = np.clip(0.35 + 0.35 * clouds, 0.0, 1.0)[..., None]
+    waves = noise.standard_normal((_WAVES, 3)) * _WAVE_RAD / float(theta[-1, 0, 0])
+    crests = np.sin(normals @ waves.T + noise.uniform(0.0, 2.0 * np.pi, _WAVES))
+    share = np.clip(0.35 + 0.35 * crests.sum(axis=-1) / math.sqrt(_WAVES / 2), 0.0, 1.0)[..., None]
     albedo = (1.0 - share) * np.array(_SEA_RGB) + share * np.array(_CLOUD_RGB)
     sun = np.asarray(to_sun) / np.linalg.norm(to_sun)
     colours = albedo * np.maximum(_NIGHT, normals @ sun)[..., None]
     return Mesh(
         vertices.reshape(-1, 3), triangles.astype(np.int32), colours.reshape(-1, 3).astype(np.uint8)
     )
-
-
-def _stretched(coarse: Array, size: tuple[int, int]) -> Array:
-    """Return noise (rows, columns) interpolated to ``size``, continuous across its last column."""
-    wrapped = np.concatenate([coarse, coarse[:, :1]], axis=1)
-    whole = cv2.resize(wrapped, (size[1] + 1, size[0]), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(whole[:, :-1], dtype=float)
 
 
 def corridor_of(scenario: FlightScenario, chaser: int) -> NDArray[np.float32] | None:

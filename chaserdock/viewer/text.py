@@ -57,8 +57,12 @@ def head(
         lines.append("the verdict needs the log: `chaserdock judge`")
     if report is not None:
         lines.append(f'<a href="{report}" target="_blank">report</a>')
-    rows = "" if verdict is None else markdown_table(verdict.criteria)
-    return "  \n".join(lines) + (f"\n\n{rows}" if rows else "")
+    return "  \n".join(lines)
+
+
+def criteria(verdict: Verdict | None) -> str:
+    """Return the table of a verdict's criteria; empty without a verdict."""
+    return "" if verdict is None else markdown_table(verdict.criteria)
 
 
 def _numbers(chasers: tuple[int, ...]) -> str:
@@ -139,7 +143,10 @@ def faults(state: MissionState, history: History, lost: set[str]) -> str:
 
 def _chaser_faults(i: int, chaser: ChaserState) -> list[str]:
     out = []
-    if chaser.wrench is not None and chaser.wrench.mode in ("track", "brake", "coast"):
+    modes = {"track", "brake", "coast"}
+    if chaser.docking is not None and chaser.docking.latched:
+        modes.remove("coast")  # at its port it is meant to
+    if chaser.wrench is not None and chaser.wrench.mode in modes:
         out.append(f"chaser {i}: the controller commands {chaser.wrench.mode}")
     if (safety := chaser.safety) is not None and not safety.safe:
         out.append(

@@ -457,6 +457,9 @@ def test_criterion_that_is_not_judged_states_its_limit_and_why() -> None:
     assert (rate.outcome, rate.measured, rate.limit) == ("not judged", None, 0.05)
     assert rate.note == "the flight ends at 40 s, detumble is at 50 s"
     assert rows["collisions"].outcome == "not judged"
+    reason = "success.latched: the flight ends at 40 s, its approach is at 50 s"
+    late = {row.name: row for row in judge(result, s, [reason])}["latched and verified"]
+    assert (late.outcome, late.limit) == ("not judged", None)
     assert rows["latched and verified"].outcome == "not met"
     assert "not verified by a pull test" in rows["latched and verified"].failure
 

@@ -380,7 +380,9 @@ def test_names_of_phases_do_not_overlap_and_stay_within_the_axes(tmp_path: Path)
 
 def test_transient_does_not_set_the_scale_of_errors(tmp_path: Path) -> None:
     flight = phases_flight(tmp_path / "a.mcap", 1)
-    flight.scenario = flight.scenario.model_copy(update={"settling_s": 10.0})
+    success = flight.scenario.success.model_copy(update={"steady_position_rms_m": 1e-4})
+    changes = {"settling_s": 10.0, "success": success}
+    flight.scenario = flight.scenario.model_copy(update=changes)
     times = np.arange(301) / 15.0
     error = np.where(times < 8.0, 0.5, 0.001)
     flight.estimated_errors = {0: np.stack([times, error, error], axis=1)}
@@ -389,9 +391,10 @@ def test_transient_does_not_set_the_scale_of_errors(tmp_path: Path) -> None:
             "chaserdock.analysis.figures.tracking_errors", lambda *_: (times, error, error)
         )
         figure = tracking(flight, Traces({}, {}, {}))
-    late = figure.axes[3]
-    assert late.get_ylabel() == "position error / mm"
+    whole, late = figure.axes[2:4]
+    assert late.get_ylabel() == whole.get_ylabel() == "position error / mm"
     assert 1.0 < late.get_ylim()[1] < 1.5
+    assert whole.get_ylim()[0] < 0.1  # the limit is in the picture
 
 
 def test_charts_have_the_values_of_the_figures(tmp_path: Path) -> None:

@@ -174,7 +174,7 @@ def test_viewer_says_all_of_the_verdict_of_a_log(log: Path) -> None:
     mission = LoggedMission(log)
     verdict = Judgement(log).wait()
     head = viewer_text.head(mission.scenario, mission.at(1.0), "log", None, verdict)
-    assert said(head) == []
+    assert said(f"{head}\n{viewer_text.criteria(verdict)}") == []
     live = viewer_text.head(mission.scenario, mission.at(1.1), "lockstep", 1.0)
     assert "the verdict needs the log" in live
 

@@ -18,11 +18,13 @@ import msgspec
 import numpy as np
 import pytest
 import viser
+from chaserdock_models import rotations
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     BodyTruth,
     CommandReply,
+    DockingStatus,
     Event,
     Image,
     MissionEnd,
@@ -34,6 +36,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.transport import Link, Node
+from chaserdock_world.orbit import earth_disc
 from harness import ROOT, chaserdock, finished
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -60,6 +63,7 @@ from chaserdock.viewer.logged import LoggedMission
 from chaserdock.viewer.page import Timeline, with_age
 from chaserdock.viewer.player import advance
 from chaserdock.viewer.report_page import ReportPage
+from chaserdock.viewer.scene import VIEWS, SceneView, ViewFrom
 from chaserdock.viewer.server import page_server
 from chaserdock.viewer.snapshot import MissionState
 
@@ -186,6 +190,17 @@ def test_faults_are_listed(mission: LoggedMission) -> None:
         "chaser 0: fallback (brake)",
     ):
         assert text in listed
+
+
+def test_coasting_is_a_fault_except_at_a_port(mission: LoggedMission) -> None:
+    state = mission.at(1.0)
+    assert state.chasers[0].wrench is not None
+    coast = msgspec.structs.replace(state.chasers[0].wrench, mode="coast")
+    state.update(topics.WRENCH, coast)
+    assert "commands coast" in words.faults(state, mission.history, set())
+    at_port = DockingStatus(chaser=0, contact=True, armed=True, latched=True)
+    state.update(topics.DOCKING, at_port)
+    assert words.faults(state, mission.history, set()) == "none"
 
 
 # -- the past --------------------------------------------------------------------------------------
@@ -398,6 +413,43 @@ def test_time_line_plays_to_its_end_and_follows_the_slider() -> None:
     assert not line.playing
 
 
+@pytest.mark.parametrize("view", VIEWS)
+def test_labels_move_with_the_picture_that_shows_their_bodies(
+    mission: LoggedMission, view: ViewFrom
+) -> None:
+    """No label has a parent that moves: viser would draw it where the parent was in the picture
+    before.
+    """
+    with page_server(DEFAULT_HOST, None, TOKEN) as server:
+        scene = SceneView(server, mission.scenario)
+        scene.view, state = view, mission.at(1.0)
+        scene.draw(state, mission.history, slow=True)
+        numbers = [server.scene.get_handle_by_name(f"/number_{i}") for i in (0, 1)]
+        target = state.true_target()
+        assert target is not None
+        for i in (0, 1):
+            chaser = state.chaser(i)
+            assert chaser is not None
+            up = np.array([0.0, 0.0, 0.75 * mission.scenario.chaser.size_m[2]])
+            above = chaser.position_m + rotations.rotate(chaser.q_wxyz, up)
+            beside = above - target.position_m
+            expected = {
+                "the world": above,
+                "beside the target": beside,
+                "on the target": rotations.rotate_inverse(target.q_wxyz, beside),
+            }[view]
+            label = numbers[i]
+            assert label is not None
+            assert label.visible
+            assert label.position == pytest.approx(expected)
+        radius = server.scene.get_handle_by_name("/radius_1")
+        assert radius is not None
+        assert radius.visible
+        scene.show_scale(False)
+        scene.draw(state, mission.history, slow=True)
+        assert not radius.visible
+
+
 # -- shapes ----------------------------------------------------------------------------------------
 
 
@@ -438,6 +490,29 @@ def test_the_earth_fills_its_disc_outside_the_scene() -> None:
     assert np.all(np.einsum("ij,ij->i", normals, three[:, 0]) <= 1e-9)
     night = shapes.earth(axis, radius_rad, axis, reach_m)
     assert mesh.colours.mean() > 5.0 * night.colours.mean() > 0.0
+
+
+@pytest.mark.parametrize("name", ["v-bar", "low-orbit", "harsh-light", "markerless-docking"])
+def test_the_first_view_shows_the_edge_of_the_earth(name: str) -> None:
+    """With stars and Earth within its range, and the stars outside the scene."""
+    scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml")
+    disc = earth_disc(scenario)
+    assert disc is not None
+    towards, radius_rad = disc
+    with page_server(DEFAULT_HOST, None, TOKEN) as server:
+        SceneView(server, scenario)
+        camera = server.initial_camera
+        stars = server.scene.get_handle_by_name("/scene/stars")
+        assert isinstance(stars, viser.PointCloudHandle)
+        stars_m = np.linalg.norm(stars.points, axis=1)
+    ahead = -camera.position / np.linalg.norm(camera.position)
+    reach_m = max(float(np.linalg.norm(c.position_m)) for c in scenario.chasers)
+    earth = shapes.earth(np.array(towards), radius_rad, np.array(towards), reach_m)
+    earth_m = np.linalg.norm(earth.vertices_m, axis=1)
+    from_edge_rad = np.arccos(ahead @ towards / np.linalg.norm(towards)) - radius_rad
+    assert 0.1 < from_edge_rad < 0.4
+    assert stars_m.min() > 5.0 * np.linalg.norm(camera.position)
+    assert camera.far > 1.2 * max(stars_m.max(), earth_m.max())
 
 
 def test_corridor_covers_the_allowed_region() -> None:

@@ -119,6 +119,7 @@
   function draw() {
     const ratio = window.devicePixelRatio || 1;
     const width = canvas.clientWidth, height = canvas.clientHeight;
+    if (!width || !height) return;  // not laid out yet
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
       canvas.width = Math.round(width * ratio); canvas.height = Math.round(height * ratio);
     }
@@ -129,7 +130,9 @@
     const eye = [Math.cos(elevation) * Math.cos(azimuth), Math.cos(elevation) * Math.sin(azimuth), Math.sin(elevation)];
     const right = unit([-eye[1], eye[0], 0]);
     const up = [eye[1] * right[2] - eye[2] * right[1], eye[2] * right[0] - eye[0] * right[2], eye[0] * right[1] - eye[1] * right[0]];
-    const reach = 3.1 * data.reach_m / zoom, focal = 1.25 * Math.min(width, height * 1.35);
+    const poses = data.chasers.map((c) => pose(c, time));
+    const nearest = Math.min(...poses.map((p) => Math.hypot(...minus(p.p, target.p))));  // from afar one is in the picture
+    const reach = 3.1 * Math.max(data.reach_m, nearest) / zoom, focal = 1.25 * Math.min(width, height * 1.35);
     const centre = target.p;
     function see(world) {  // image x and y, and depth
       const v = apply(turn, minus(world, centre));
@@ -200,10 +203,16 @@
         if (p && q && r) raster.triangle(p, q, r, lit(coat, apply(body.m, n)));
       });
     }
-    const poses = data.chasers.map((c) => pose(c, time));
     [target, ...poses].forEach((body, k) => add(body, shapes[k]));
     raster.end(context, width, height);
 
+    function label(text, [x, y]) {
+      context.fillStyle = css("--ink"); context.font = "600 12px system-ui, sans-serif";
+      context.strokeStyle = css("--panel"); context.lineWidth = 3;
+      context.strokeText(text, x + 26, y - 22);
+      context.fillText(text, x + 26, y - 22);
+    }
+    if (nearest > data.reach_m) label("target", see(target.p));  // a dot from so far away
     // Camera frustums, bright while the image is used.
     data.chasers.forEach((c, k) => {
       const colour = css("--series-" + (c.id % 8));
@@ -213,11 +222,7 @@
       far.forEach((corner) => line([origin, corner], colour, 0.8));
       line([...far, far[0]], colour, 0.8);
       context.globalAlpha = 1;
-      context.fillStyle = css("--ink"); context.font = "600 12px system-ui, sans-serif";
-      const label = see(sum(poses[k].p, [0, 0, 0]));
-      context.strokeStyle = css("--panel"); context.lineWidth = 3;
-      context.strokeText(String(c.id), label[0] + 26, label[1] - 22);
-      context.fillText(String(c.id), label[0] + 26, label[1] - 22);
+      label(String(c.id), see(poses[k].p));
     });
 
     clock.textContent = time.toFixed(1) + " s";

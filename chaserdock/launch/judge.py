@@ -92,7 +92,7 @@ def judge_mission(
         print_outcome(outcome, show)
         page = _write_page(log)
         if show is not Show.json:
-            print(files_line(folder, page), flush=True)
+            print(files_lines(folder, page), flush=True)
         return outcome.status
     finally:
         node.close()  # last, because the router may exit once this node has left
@@ -148,15 +148,15 @@ def _write_page(log: Path) -> Path | None:
         return None
 
 
-def files_line(folder: Path, page: Path | None) -> str:
-    """Return the folder of a mission, as the host of a container names it, and its files."""
+def files_lines(folder: Path, page: Path | None) -> str:
+    """Return the folder of a mission, as the host of a container names it; below it, its files."""
     from chaserdock.analysis.summary import SUMMARY_NAME
 
     host = os.environ.get(HOST_FOLDER)
     where = str(folder) if host is None else f"on the host, {host}/{folder.name}"
     report = [] if page is None else [page.name]
     others = [name for name in (LOG_NAME, SUMMARY_NAME) if (folder / name).is_file()]
-    return f"{where}: {', '.join([*report, *others])}"
+    return f"{where}\n  {', '.join([*report, *others])}"
 
 
 def _wait_for_end(log: Path) -> bool:

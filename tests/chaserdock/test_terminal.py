@@ -19,7 +19,7 @@ from chaserdock.analysis.figures import FIGURES
 from chaserdock.cli.analysis import report
 from chaserdock.cli.main import app
 from chaserdock.cli.simulate import simulate
-from chaserdock.launch.judge import HOST_FOLDER, files_line
+from chaserdock.launch.judge import HOST_FOLDER, files_lines
 from chaserdock.launch.launcher import MissionOutcome, print_where
 from chaserdock.simulation import seeds
 from chaserdock.simulation.checks.check import Violation
@@ -130,7 +130,7 @@ def test_last_line_of_compose_names_the_files_on_the_host(
     for name in ("mission.mcap", "summary.json"):
         (folder / name).touch()
     names = "mission.mcap, summary.json"
-    assert files_line(folder, None) == f"{folder}: {names}"
+    assert files_lines(folder, None) == f"{folder}\n  {names}"
     monkeypatch.setenv(HOST_FOLDER, host)
-    line = files_line(folder, folder / "report.html")
-    assert line == f"on the host, ./runs/{folder.name}: report.html, {names}"
+    line = files_lines(folder, folder / "report.html")
+    assert line == f"on the host, ./runs/{folder.name}\n  report.html, {names}"

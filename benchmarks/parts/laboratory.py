@@ -206,15 +206,17 @@ def fly_native(seed: int) -> float:
 
 def tracking(options: Options) -> Figures:
     """Fly the tracking flight of the emulated laboratory by the gateway, and in the world with
-    equal errors of the sensors, 12 seeds each (``--quick``: 1).
+    equal errors of the sensors, 30 seeds each (``--quick``: 1).
     """
-    seeds, jobs = seeds_of(options, 12, 1), options.jobs
+    seeds, jobs = seeds_of(options, 30, 1), options.jobs
     kept = KeptResults(options.results, {"flight": "tracking", "faults": False}, LabFlight)
     fly = partial(fly_laboratory, "tracking", False)
     flights = kept.of(seeds, fly, LabFlight.line, jobs=jobs)
     kept_native = KeptResults(options.results, {"flight": "native tracking"}, float)
     native = kept_native.of(seeds, fly_native, lambda rms: f"native: {rms * 1e3:.3f} mm", jobs=jobs)
-    own, world = (float(np.median(x)) for x in ([f.rms_m or math.nan for f in flights], native))
+    by_gateway = [f.rms_m or math.nan for f in flights]
+    own, world = float(np.median(by_gateway)), float(np.median(native))
+    paired = np.log(np.divide(by_gateway, native))
     latencies = [f.latency_p99_s for f in flights if f.latency_p99_s is not None]
     return {
         "flights": len(flights),
@@ -222,6 +224,8 @@ def tracking(options: Options) -> Figures:
         "gateway_rms_m": own,
         "native_rms_m": world,
         "gateway_over_native": own / world,
+        "paired_ratios_geometric_mean": float(np.exp(paired.mean())),
+        "paired_ratios_standard_error": float(paired.std() / math.sqrt(len(paired))),
         "added_latency_p99_s": max(latencies, default=math.nan),
     }
 

@@ -88,7 +88,10 @@ class ForkServer:
         self._server.wait()
 
     def _receive(self) -> dict[str, int]:
-        message = self._socket.recv(_MESSAGE_BYTES)
+        try:
+            message = self._socket.recv(_MESSAGE_BYTES)
+        except ConnectionError:  # it was lost before it had read a request
+            message = b""
         if not message:
             self._end_all()
             raise ConnectionError("the server of this mission's processes is lost")

@@ -75,6 +75,8 @@ def test_it_ends_with_its_standard_input(server: ForkServer, tmp_path: Path) -> 
 def test_a_lost_server_takes_its_processes_with_it(tmp_path: Path) -> None:
     server = ForkServer()
     process = waiting(server, tmp_path / "out.txt")
+    server._server.send_signal(signal.SIGSTOP)
+    process.send_signal(signal.SIGCONT)  # it is lost before it reads this
     server._server.kill()
     assert process.wait() == -signal.SIGKILL
     with suppress(psutil.NoSuchProcess):

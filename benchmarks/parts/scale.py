@@ -106,10 +106,9 @@ def cpu_s_of(launcher: psutil.Process) -> dict[str, float]:
     used: dict[str, float] = defaultdict(float)
     for child in launcher.children(recursive=True):
         with suppress(psutil.NoSuchProcess, psutil.AccessDenied):
-            program, command, *_ = *" ".join(child.cmdline()).split(), ""
-            times = child.cpu_times()
-            if program == "chaserdock":
-                used[command] += times.user + times.system
+            words, times = " ".join(child.cmdline()).split(), child.cpu_times()
+            if "chaserdock" in words:
+                used[words[words.index("chaserdock") + 1]] += times.user + times.system
     return used
 
 

@@ -58,6 +58,8 @@ Earth leaves it; smaller: it fills it.
 """
 _FIRST_VIEW = np.array([-0.55, -0.85, 0.55])
 """Direction from the target to the first view: from behind and above chaser 0."""
+_Disc = tuple[tuple[float, float, float], float]
+"""Direction towards the Earth, and its angular radius, rad."""
 _IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
@@ -70,7 +72,17 @@ def _faint(colour: tuple[int, int, int]) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _earth_disc(scenario: FlightScenario) -> tuple[tuple[float, float, float], float] | None:
+def _view_beside(axis: Array, radius_rad: float) -> Array:
+    """Return the direction (3,) from the target to a first view that has the edge of the Earth in
+    the picture. axis (3,): unit vector towards the Earth.
+    """
+    turns = np.arange(0.0, 2.0 * math.pi, math.pi / 8.0)
+    views = [rotations.rotate(rotations.exp([0.0, 0.0, turn]), _FIRST_VIEW) for turn in turns]
+    away_rad = [math.acos(-view @ axis / np.linalg.norm(view)) for view in views]
+    return views[int(np.argmin(np.abs(np.array(away_rad) - radius_rad - _BESIDE_EARTH_RAD)))]
+
+
+def _earth_disc(scenario: FlightScenario) -> _Disc | None:
     """Return the Earth's disc as images show it. A flight scenario knows it by its orbit only."""
     known = isinstance(scenario, Scenario) or scenario.orbit is not None
     return earth_disc(cast("Scenario", scenario)) if known else None
@@ -86,9 +98,10 @@ class SceneView:
         self._root = scene.add_frame("/scene", show_axes=False)
         self._root_pose = _IDENTITY
         self._reach_m = max(math.hypot(*c.position_m) for c in scenario.chasers)
-        self._stars_m = max(_STARS_M, _STARS_REACH * self._reach_m)
-        self._disc = _earth_disc(scenario)
-        self._add_space()
+        stars_m = max(_STARS_M, _STARS_REACH * self._reach_m)
+        first_view = self._add_space(_earth_disc(scenario), stars_m)
+        near = first_view * [1.0, 1.0, 0.0]
+        self._near = near / np.linalg.norm(near)
         self._add_scale()
 
         self._target = self._body("/scene/target", shapes.mesh_of(target_body(scenario)))
@@ -156,47 +169,36 @@ class SceneView:
                 )
 
         self.view: ViewFrom = VIEWS[0]
-        x, y, z = 2.0 * self._reach_m * self._first_view()
+        x, y, z = 2.0 * self._reach_m * first_view
         server.initial_camera.position = (x, y, z)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
-        server.initial_camera.far = 10.0 * self._stars_m
+        server.initial_camera.far = 10.0 * stars_m
         server.initial_camera.near = 1e-5 * server.initial_camera.far
 
-    def _first_view(self) -> Array:
-        """Return the direction (3,) from the target to the first view; the edge of an Earth is
-        in the picture.
-        """
-        if self._disc is None:
-            return _FIRST_VIEW
-        towards, radius_rad = self._disc
-        axis = np.array(towards) / np.linalg.norm(towards)
-        turns = np.arange(0.0, 2.0 * math.pi, math.pi / 8.0)
-        views = [rotations.rotate(rotations.exp([0.0, 0.0, turn]), _FIRST_VIEW) for turn in turns]
-        away_rad = [math.acos(-view @ axis / np.linalg.norm(view)) for view in views]
-        wanted_rad = radius_rad + _BESIDE_EARTH_RAD
-        return views[int(np.argmin(np.abs(np.array(away_rad) - wanted_rad)))]
-
-    def _add_space(self) -> None:
+    def _add_space(self, disc: _Disc | None, stars_m: float) -> Array:
         """Add the stars and the Earth of the simulated images, on black whatever the theme of the
-        page.
+        page. Return the direction (3,) from the target to the first view.
         """
+        first_view = _FIRST_VIEW
         self._scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
         directions, levels = star_field()
-        if self._disc is not None:
-            towards, radius_rad = self._disc
+        if disc is not None:
+            towards, radius_rad = disc
             axis = np.array(towards) / np.linalg.norm(towards)
             sun = np.array(to_sun(cast("Scenario", self._scenario)))
             self._body("/scene/earth", shapes.earth(axis, radius_rad, sun, self._reach_m))
             beside = directions @ axis < math.cos(radius_rad)
             directions, levels = directions[beside], levels[beside]
+            first_view = _view_beside(axis, radius_rad)
         self._scene.add_point_cloud(
             "/scene/stars",
-            (self._stars_m * directions).astype(np.float32),
+            (stars_m * directions).astype(np.float32),
             np.repeat(levels[:, None], 3, axis=1),
-            point_size=0.0015 * self._stars_m,
+            point_size=0.0015 * stars_m,
             point_shape="circle",
             precision="float32",
         )
+        return first_view
 
     def _add_scale(self) -> None:
         """Add rings around the target, in the plane z = 0 of WRF, with their radii."""
@@ -304,10 +306,8 @@ class SceneView:
 
     def _place_radii(self, target_m: Array) -> None:
         """Place the radii of the rings at their nearest points. ``target_m`` (3,): WRF."""
-        near = self._first_view() * [1.0, 1.0, 0.0]
-        near /= np.linalg.norm(near)
         for radius_m, label in self._radii.items():
-            label.position = self._on_screen(target_m + radius_m * near)
+            label.position = self._on_screen(target_m + radius_m * self._near)
             label.visible = self._rings.visible
 
     def _place(self, node: Any, pose: Pose | None) -> None:

@@ -232,6 +232,35 @@ def test_a_prediction_changes_where_is_looked_but_not_what_is_found():
         assert np.linalg.norm(error[:3]) < 1.5e-3
 
 
+@pytest.mark.parametrize("name", ["servicer", "paper"])
+def test_markers_are_read_where_a_prediction_puts_them_without_a_search(name, monkeypatch):
+    scene, generator = Scene(name, 960, 540), np.random.default_rng(8)
+    search, searched, nees, apart = detect.detect, [], [], []
+
+    def counted(*arguments):
+        searched.append(True)
+        return search(*arguments)
+
+    monkeypatch.setattr(detect, "detect", counted)
+    for position, q, image in scene.random_views(40, 0.6, 1.8, 3):
+        plain = scene.perception.estimate(image)
+        searched.clear()
+        turn = rotations.exp(np.radians(0.3) * generator.normal(size=3))
+        predicted = position + 2e-3 * generator.normal(size=3), rotations.multiply(q, turn)
+        guided = scene.perception.estimate(image, predicted)
+        if searched:
+            continue
+        best, other = guided.solutions[0], plain.solutions[0]
+        error = error_of(best, position, q)
+        nees.append(error @ np.linalg.solve(best.covariance, error))
+        change = error_of(best, other.position_irf_m, other.q_irf_trf_wxyz)
+        apart.append(change @ np.linalg.solve(best.covariance, change))
+        assert np.array_equal(np.sort(guided.marker_ids), np.sort(plain.marker_ids))
+    assert len(nees) >= 28
+    assert 3.0 < np.mean(nees) < 8.5
+    assert np.median(apart) < 0.1  # of 6
+
+
 def test_estimates_repeat_bit_for_bit_and_keep_no_memory():
     scene = Scene("servicer")
     position, q = (

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel
@@ -64,7 +65,16 @@ class PerceptionResult:
 _INNER_PX = (3.5, 7.0, 10.5)
 """Distances inside a marker's side, px, of a contour that a threshold window finds there: half a
 window, of up to 23 px, in steps that the fit of sides reaches."""
+_FAR_MOVE_PX, _SETTLED_MOVE_PX = 1.0, 0.3
+"""Corrections, px, of the corners that a prediction gives: above the first the fit is repeated from
+its result, and above the second that repetition is not trusted. A single fit from further away
+takes an inner cell's edge for a side in 1 of 100 images; one that is repeated never did."""
 _NO_COARSE = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2)), CornerErrors.even(np.zeros(0))
+
+
+def _largest_move_px(refined: corners.Refined, start_px: Array) -> Array:
+    """Return by how much a refinement moved the corners (n, 4, 2) of each marker at most."""
+    return np.abs(refined.corners_px - start_px).max(axis=(1, 2))
 
 
 class _Further:
@@ -151,9 +161,10 @@ class Perception:
     ) -> PerceptionResult:
         """Estimate the target's pose in a grey image (h, w), uint8.
 
-        ``predicted``: position in IRF (3,), metres, and rotation TRF to IRF (4,), if known; it
-        selects the region that is searched first and does not affect the result. Raises ValueError
-        for an image of another shape or type than the camera's.
+        ``predicted``: position in IRF (3,), metres, and rotation TRF to IRF (4,), if known. Markers
+        are read where it puts them; if none is there, its region is searched, then the whole
+        image. Corners are fitted to the image in each case. Raises ValueError for an image of
+        another shape or type than the camera's.
         """
         shape = (self.camera.height_px, self.camera.width_px)
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
@@ -167,11 +178,12 @@ class Perception:
         if self.method != "default":
             return self._estimate_paper(image)
 
-        region = (
-            None if predicted is None else detect.region_of(self.camera, self.model, *predicted)
-        )
-        if region is not None:
-            sighting = self._estimate_in(image, region)
+        if predicted is not None:
+            sighting = self._estimate_at(image, *predicted)
+            if sighting.solutions:
+                return sighting
+            region = detect.region_of(self.camera, self.model, *predicted)
+            sighting = sighting if region is None else self._estimate_in(image, region)
             if sighting.solutions:
                 return sighting
 
@@ -183,6 +195,30 @@ class Perception:
             return sighting
         again = self._estimate_in(image, None, thorough=True)
         return again if again.solutions else sighting
+
+    def _estimate_at(
+        self, image: NDArray[np.uint8], position_m: ArrayLike, q_wxyz: ArrayLike
+    ) -> PerceptionResult:
+        """Return what markers show that are read where a predicted pose puts them, and others that
+        their pose shows; no solution if none is there.
+        """
+        nothing = PerceptionResult((), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), ())
+        position, q = np.asarray(position_m, dtype=float), np.asarray(q_wxyz, dtype=float)
+        if not (np.isfinite(position).all() and np.isfinite(q).all()):
+            return nothing
+        pose = PoseInCamera(position, rotations.to_matrix(q))
+        read = self.reader.read(image, self.camera, pose, _NO_COARSE[0])
+        rows, px = read.rows, read.corners_px[read.rows]
+        refined = self.refined(image, px, rows)
+        far = refined.good & (_largest_move_px(refined, px) > _FAR_MOVE_PX)
+        if far.any():
+            again = self.refined(image, refined.corners_px[far], rows[far])
+            settled = again.good & (
+                _largest_move_px(again, refined.corners_px[far]) <= _SETTLED_MOVE_PX
+            )
+            refined = refined.with_others(far, replace(again, good=settled))
+        rows, refined = rows[refined.good], refined.part(refined.good)
+        return self._solved(image, self.table.ids[rows], rows, refined, _NO_COARSE)
 
     def _estimate_in(
         self, image: NDArray[np.uint8], region: detect.Region | None, thorough: bool = False
@@ -209,6 +245,21 @@ class Perception:
             errors = CornerErrors.even(corners.coarse_sigma_px(self.camera, px[lost]))
             coarse = rows[lost], px[lost], errors
             refined, rows = refined.part(refined.good), rows[refined.good]
+        return self._solved(image, found.ids, rows, refined, coarse, thorough)
+
+    def _solved(
+        self,
+        image: NDArray[np.uint8],
+        ids: NDArray[np.int64],
+        rows: NDArray[np.intp],
+        refined: corners.Refined,
+        coarse: tuple[NDArray[np.intp], Array, CornerErrors],
+        thorough: bool = False,
+    ) -> PerceptionResult:
+        """Return the sighting of markers ``rows`` with refined corners, and of ``coarse`` ones.
+
+        ``ids``: all that were found.
+        """
         px, errors = refined.corners_px, refined.errors
         further = _Further(self, image, coarse)
         solutions, used = pnp.solve(self.camera, self.table, rows, px, errors, further.markers)
@@ -218,7 +269,7 @@ class Perception:
             further = _Further(self, image, _NO_COARSE)
             solutions, used = pnp.solve(self.camera, self.table, rows, px, errors, further.markers)
         rows, px = further.after(rows, px)
-        return self._sighting(found.ids, solutions, self.table.ids[rows[used]], px[used])
+        return self._sighting(ids, solutions, self.table.ids[rows[used]], px[used])
 
     def refined(
         self, image: NDArray[np.uint8], px: Array, rows: NDArray[np.intp], known: int = 0

@@ -139,12 +139,17 @@ static void draw_stars(void) {
     const int64_t count = whole(0, 20), width = whole(1, 20), height = whole(1, 20);
     double *directions = doubles(3 * count, -1.0, 1.0), *lens = doubles(6, -10.0, 20.0);
     uint8_t *levels = block((size_t)count), *canvas = bytes(width * height);
+    int64_t *at = block((size_t)count * 2 * sizeof(int64_t));
     if (count) memset(levels, 200, (size_t)count);
     memset(canvas, 4, (size_t)(width * height));
-    NAME(draw_stars)(directions, levels, count, lens, width, height, canvas);
+    int64_t stated = NAME(draw_stars)(directions, levels, count, lens, width, height, canvas, at);
     int64_t drawn = 0;
     for (int64_t i = 0; i < width * height; i++) drawn += canvas[i] != 4;
-    CHECK(drawn <= count);
+    CHECK(drawn <= stated && stated <= count);
+    for (int64_t i = 0; i < stated; i++) {
+        CHECK(0 <= at[2 * i] && at[2 * i] < width && 0 <= at[2 * i + 1] && at[2 * i + 1] < height);
+        CHECK(canvas[at[2 * i + 1] * width + at[2 * i]] == 200);
+    }
 }
 
 static void draw_meshes(void) {

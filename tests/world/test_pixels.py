@@ -9,7 +9,7 @@ import pytest
 from chaserdock_models.camera import Camera
 from chaserdock_models.native.build import X86_64
 from chaserdock_protocol.scenario.camera import Effects
-from chaserdock_world.rendering import background, effects
+from chaserdock_world.rendering import background, effects, lens
 from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.native import LIBRARY
 from chaserdock_world.rendering.rasterizer import upsample
@@ -95,4 +95,18 @@ def test_stars_are_drawn_at_their_projection() -> None:
                 column, row = np.rint(camera.project_ideal(star) - origin)
                 if star[2] > 0.1 and 0 <= column < size[0] and 0 <= row < size[1]:
                     expected[int(row), int(column)] = level
-            np.testing.assert_array_equal(seen.draw(q), expected)
+            sky = seen.draw(q)
+            np.testing.assert_array_equal(sky.image, expected)
+            assert sky.stars is not None
+            for sigma_px in (0.0, 0.5, 1.3):
+                blurred = lens.spread_points(expected, sigma_px)
+                np.testing.assert_array_equal(lens.spread_sky(sky, sigma_px), blurred)
+
+
+def test_stars_at_the_border_and_beside_each_other_are_blurred_as_the_whole_image_is():
+    image = np.full((30, 40), background.SPACE_LEVEL, dtype=np.uint8)
+    at = np.array([[0, 0], [39, 0], [1, 28], [39, 29], [20, 15], [21, 15], [23, 17], [20, 15]])
+    image[at[:, 1], at[:, 0]] = [180, 90, 120, 60, 200, 150, 30, 201]
+    for sigma_px in (0.4, 0.8, 2.0):
+        blurred = lens.spread_sky(background.Sky(image, at), sigma_px)
+        np.testing.assert_array_equal(blurred, lens.spread_points(image, sigma_px))

@@ -99,6 +99,18 @@ class Earth:
     radius_rad: float
 
 
+@dataclass(frozen=True)
+class Sky:
+    """What is behind all bodies.
+
+    ``image`` (h, w), ideal. ``stars`` (n, 2): columns and rows of the only pixels that differ from
+    `SPACE_LEVEL`; None with the Earth in view.
+    """
+
+    image: NDArray[np.uint8]
+    stars: NDArray[np.int64] | None
+
+
 class Background:
     """Draw the background of ideal images that begin at ``origin_px``.
 
@@ -118,31 +130,30 @@ class Background:
             self._albedo = _albedo_map(generator)
             self._rays = _rays(camera, origin_px, size_px, _EARTH_STEP_PX)
 
-    def draw(self, q_w_irf_wxyz: Array, light: Light | None = None) -> NDArray[np.uint8]:
-        """Return the ideal image (h, w), uint8, of stars and Earth; ``light`` illuminates the
-        Earth.
-        """
+    def draw(self, q_w_irf_wxyz: Array, light: Light | None = None) -> Sky:
+        """Draw stars and Earth; ``light`` illuminates the Earth."""
         width, height = self._size
         canvas = np.full((height, width), SPACE_LEVEL, dtype=np.uint8)
         turn = rotations.to_matrix(q_w_irf_wxyz)
-        directions = self._stars @ turn
-        function("draw_stars")(
+        directions, at = self._stars @ turn, np.empty((_STARS, 2), dtype=np.int64)
+        drawn = function("draw_stars", c_int64)(
             address(directions), address(self._star_levels), c_int64(_STARS), address(self._lens),
-            c_int64(width), c_int64(height), address(canvas),
+            c_int64(width), c_int64(height), address(canvas), address(at),
         )  # fmt: skip
-        if self._earth is not None:
-            self._draw_earth(canvas, turn, self._earth, light or Light())
-        return canvas
+        earth = self._earth is not None and self._draw_earth(
+            canvas, turn, self._earth, light or Light()
+        )
+        return Sky(canvas, None if earth else at[:drawn])
 
     def _draw_earth(
         self, canvas: NDArray[np.uint8], turn: Array, earth: Earth, light: Light
-    ) -> None:
-        """Draw a Lambertian sphere with clouds fixed to it."""
+    ) -> bool:
+        """Draw a Lambertian sphere with clouds fixed to it; return whether it is in view."""
         centre = np.array(earth.direction_w) / np.linalg.norm(earth.direction_w)
         rays = self._rays @ turn.T  # in WRF, unit
         cosine = rays @ centre
         if float(cosine.max()) < np.cos(earth.radius_rad) - 0.05:
-            return
+            return False
         # A sphere of radius sin(radius) at distance 1.
         radius = np.sin(earth.radius_rad)
         inside = cosine**2 - (1.0 - radius**2)
@@ -168,6 +179,7 @@ class Background:
         shown = cv2.resize(level.astype(np.float32), size_px, interpolation=cv2.INTER_LINEAR)
         mixed = canvas * (1.0 - share) + shown * share
         np.copyto(canvas, np.clip(np.rint(mixed), 0, 255).astype(np.uint8))
+        return True
 
 
 def _rays(camera: Camera, origin_px: Array, size_px: tuple[int, int], step_px: int) -> Array:

@@ -213,7 +213,7 @@ class MeshRenderer:
         bodies = [self._target, *(self._body(tuple(boxes)) for boxes, _, _ in obstacles)]
         placed = [(target_p_w_m, target_q_w_trf_wxyz), *((p, q) for _, p, q in obstacles)]
         poses = np.array([np.concatenate([p, q]) for p, q in placed], dtype=float)
-        canvas = self._background.draw(q_w_irf, light)
+        canvas = self._background.draw(q_w_irf, light).image
         self._draw(canvas, camera, bodies, poses, light)
         return self._lens.distort(spread_points(canvas, self._point_spread_px))
 

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import textures
 from .background import Background, Earth, Light
 from .dirty_rects import Rectangle, merge_overlapping
-from .lens import LensMap, spread_points
+from .lens import LensMap, spread_points, spread_sky
 from .scene_geometry import (
     Frustum,
     Obstacle,
@@ -127,8 +127,8 @@ class Renderer:
             self._frustum, shapes, np.concatenate([position, q_w_irf]), poses
         )
 
-        background = self._background.draw(q_w_irf, light)
-        canvas = spread_points(background, self._point_spread_px)
+        sky = self._background.draw(q_w_irf, light)
+        background, canvas = sky.image, spread_sky(sky, self._point_spread_px)
         if not len(visible):
             return self._lens.distort(canvas)
 

@@ -70,6 +70,7 @@ _FAR_MOVE_PX, _SETTLED_MOVE_PX = 1.0, 0.3
 its result, and above the second that repetition is not trusted. A single fit from further away
 takes an inner cell's edge for a side in 1 of 100 images; one that is repeated never did."""
 _NO_COARSE = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2)), CornerErrors.even(np.zeros(0))
+_NO_FURTHER = FurtherMarkers(*_NO_COARSE, range(0))
 
 
 def _largest_move_px(refined: corners.Refined, start_px: Array) -> Array:
@@ -100,6 +101,8 @@ class _Further:
         by = self._perception
         read = by.reader.read(self._image, by.camera, pose, used, reach)
         rows, (coarse, px, errors) = read.rows, self._coarse
+        if not (len(rows) or len(read.faint) or len(coarse)):
+            return len(self._rows), _NO_FURTHER
         new = ~np.isin(coarse, used)
         coarse, px, errors = coarse[new], px[new], errors.part(new)
         if len(rows):

@@ -323,9 +323,12 @@ EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double sa
 
 /* Draw stars in ``directions`` (count, 3) of IRF, each one pixel of its level, on a canvas (height,
  * width), except those within 0.1 of the camera's plane or at NaN. ``lens``: fx, fy, cx, cy, the
- * canvas' first pixel. */
-EXPORT void NAME(draw_stars)(const double *directions, const uint8_t *levels, int64_t count,
-                             const double *lens, int64_t width, int64_t height, uint8_t *canvas) {
+ * canvas' first pixel. Return how many are drawn, with their columns and rows in ``at`` (count,
+ * 2). */
+EXPORT int64_t NAME(draw_stars)(const double *directions, const uint8_t *levels, int64_t count,
+                                const double *lens, int64_t width, int64_t height, uint8_t *canvas,
+                                int64_t *at) {
+    int64_t drawn = 0;
     for (int64_t i = 0; i < count; i++) {
         const double *d = directions + 3 * i;
         if (!(d[2] > 0.1)) continue;
@@ -335,7 +338,10 @@ EXPORT void NAME(draw_stars)(const double *directions, const uint8_t *levels, in
         if (!(x > -1.0 && y > -1.0 && x < (double)width && y < (double)height)) continue;
         int64_t column = (int64_t)((x + 6755399441055744.0) - 6755399441055744.0);
         int64_t row = (int64_t)((y + 6755399441055744.0) - 6755399441055744.0);
-        if (column >= 0 && column < width && row >= 0 && row < height)
-            canvas[row * width + column] = levels[i];
+        if (!(column >= 0 && column < width && row >= 0 && row < height)) continue;
+        canvas[row * width + column] = levels[i];
+        at[2 * drawn] = column;
+        at[2 * drawn++ + 1] = row;
     }
+    return drawn;
 }

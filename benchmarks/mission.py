@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Missions in separate processes: ``python benchmarks/mission.py [--only PART ...]``.
 
-Speed and accuracy of the main mission, cost of a tick by number of chasers, memory over a simulated
-day, and commands that read logs. Measures wall time: run nothing else beside it.
+Speed and accuracy of the main mission, its cost beside that of another commit, cost of a tick by
+number of chasers, memory over a simulated day, and commands that read logs. Measures wall time: run
+nothing else beside it.
 """
 
 from common import main
-from parts import endurance, long_logs, mission_speed, scale
+from parts import against, endurance, long_logs, mission_speed, scale
 
 GROUPS = (
     mission_speed.GROUP,
+    against.GROUP,
     scale.GROUP,
     long_logs.GROUP,
     endurance.GROUP,

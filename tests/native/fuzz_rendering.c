@@ -152,6 +152,18 @@ static void draw_stars(void) {
     }
 }
 
+static void spread_and_halve(void) {
+    const int64_t height = whole(1, 6), width = whole(1, 70), reach = whole(0, 20);
+    uint8_t *fine = bytes(4 * height * width), *out = bytes(height * width);
+    uint16_t *weights = block((size_t)(2 * reach + 2) * 2),
+             *work = block((size_t)(4 * (width + reach + 1)) * 2);
+    memset(weights, 0, (size_t)(2 * reach + 2) * 2);
+    for (int i = 0; i < 256; i++) weights[whole(0, 2 * reach + 1)]++;
+    memset(fine, 77, (size_t)(4 * height * width));
+    NAME(spread_and_halve)(fine, height, width, weights, reach, out, work);
+    for (int64_t i = 0; i < height * width; i++) CHECK(out[i] == 77);
+}
+
 static void draw_meshes(void) {
     const int64_t bodies = whole(1, 2), each = whole(0, 4), m = bodies * each, width = whole(1, 70),
                   height = whole(1, 20), n = whole(1, 3);
@@ -201,5 +213,6 @@ static const Target TARGETS[] = {
     {"add_noise", add_noise},     {"visible_faces", visible_faces},
     {"paint_order", paint_order}, {"place_texture", place_texture},
     {"draw_stars", draw_stars},   {"draw_meshes", draw_meshes},
+    {"spread_and_halve", spread_and_halve},
 };
 FUZZ_MAIN(TARGETS)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -101,6 +103,26 @@ def test_stars_are_drawn_at_their_projection() -> None:
             for sigma_px in (0.0, 0.5, 1.3):
                 blurred = lens.spread_points(expected, sigma_px)
                 np.testing.assert_array_equal(lens.spread_sky(sky, sigma_px), blurred)
+
+
+@pytest.mark.parametrize("sigma_px", [0.0, 0.3, 1.2, 2.6, 8.0])
+@pytest.mark.parametrize("size", [(2, 2), (6, 130), (64, 128), (130, 262)])
+def test_a_supersampled_image_is_blurred_and_averaged_to_a_rounding(
+    size: tuple[int, int], sigma_px: float
+) -> None:
+    fine = np.random.default_rng(6).integers(0, 256, size, dtype=np.uint8)
+    got = lens.spread_and_halve(fine, sigma_px)
+    reach = math.ceil(3.0 * sigma_px)
+    exact = np.pad(fine.astype(float), reach, mode="edge")
+    if reach:
+        kernel = cv2.getGaussianKernel(2 * reach + 1, sigma_px, cv2.CV_64F)
+        exact = cv2.sepFilter2D(exact, -1, kernel, kernel)
+    exact = exact[reach : reach + size[0], reach : reach + size[1]]
+    exact = exact.reshape(size[0] // 2, 2, size[1] // 2, 2).mean(axis=(1, 3))
+    # Weights are rounded to 1/256.
+    assert np.abs(got - exact).max() <= (0.5 if sigma_px == 0.0 else 3.0)
+    if exact.size > 1000:  # ties of four levels' mean are rounded up
+        assert abs(np.mean(got - exact)) < 0.15
 
 
 def test_stars_at_the_border_and_beside_each_other_are_blurred_as_the_whole_image_is():

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import textures
 from .background import Background, Earth, Light
 from .dirty_rects import Rectangle, merge_overlapping
-from .lens import LensMap, spread_points, spread_sky
+from .lens import LensMap, spread_and_halve, spread_points, spread_sky
 from .scene_geometry import (
     Frustum,
     Obstacle,
@@ -194,10 +194,8 @@ class Renderer:
                 cv2.fillConvexPoly(fine, fixed, value, cv2.LINE_8, 4)
         if samples == 4:  # two per pixel are enough for the point spread, and faster
             fine, samples = halve(fine), 2
-        fine = spread_points(fine, samples * self._point_spread_px)
-        if samples == 2:
-            fine = halve(fine)
-        canvas[y0:y1, x0:x1] = fine
+        spread = spread_and_halve if samples == 2 else spread_points
+        canvas[y0:y1, x0:x1] = spread(fine, samples * self._point_spread_px)
 
     def _paint_texture(
         self,

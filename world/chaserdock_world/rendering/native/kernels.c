@@ -5,3 +5,4 @@
 #include "scene.c"
 #include "noise.c"
 #include "mesh.c"
+#include "blur.c"

@@ -1,0 +1,379 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Spreads calls over processes of this machine, or over the workers of a Dask cluster.
+
+Each call runs in a process that runs nothing else meanwhile, also on a worker with several threads.
+A process that has ended is replaced, and its call is repeated. A process whose chaserdock, Python
+or packages are others than here runs no call.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, BinaryIO, TypeVar, cast
+
+from chaserdock_protocol.errors import ChaserdockError, require_extra
+from chaserdock_protocol.process import SINGLE_THREADED
+
+from chaserdock.exit_codes import STOPPED
+from chaserdock.version import Version, difference, version
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where calls run: ``jobs`` at a time on this machine, or on the Dask scheduler at
+    ``cluster``.
+    """
+
+    jobs: int = 1
+    cluster: str | None = None
+
+
+HERE = Places()
+"""One call after the other in this process."""
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A call without a result: whatever ran it ended, for this ``reason``."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class _Settings:
+    attempts: int = 2  # processes that a call may end: one may be chance, as when memory is short
+    idle_s: float = 60.0  # a process on a worker ends without calls: next ones come in ms
+    end_s: float = 5.0  # time in which a process ends its call and removes its files
+    ahead: float = 1.25  # calls per thread of a cluster: others wait while a result is on its way
+    look_s: float = 2.0  # interval at which workers that have joined are counted
+    connect_s: float = 10.0  # a scheduler beside or far away answers within a second
+
+
+_SETTINGS = _Settings()
+
+
+def spread(
+    call: Callable[[T], R],
+    items: Iterable[T],
+    places: Places = HERE,
+    stop: Callable[[], bool] = lambda: False,
+) -> Iterator[tuple[T, R | Lost]]:
+    """Yield each item with the result of its call, as they end. Begin none once ``stop()``.
+
+    ``call`` and its items must be importable elsewhere and are pickled, but for one job on this
+    machine, which runs in this process. Processes of this machine end when the generator does.
+    Raises ChaserdockError, as a call does, or if a worker is not as this process.
+    """
+    if places.cluster is None and places.jobs == 1:
+        for item in items:
+            if stop():
+                return
+            yield item, call(item)
+        return
+    expected, waiting = version(), iter(items)
+    with _on_cluster(places.cluster) if places.cluster else _on_processes(places.jobs) as pool:
+        active: dict[Future[bytes], T] = {}
+        while True:
+            room = pool.room() - len(active)
+            for item in () if stop() else _first(waiting, room):
+                active[pool.submit(pickle.dumps((call, item)), expected)] = item
+            if not active:
+                return
+            for future in wait(active, _SETTINGS.look_s, FIRST_COMPLETED).done:
+                yield active.pop(future), cast("R | Lost", pool.result(future))
+
+
+def _first(items: Iterator[T], number: int) -> Iterator[T]:
+    for _, item in zip(range(number), items, strict=False):
+        yield item
+
+
+# -- Processes -------------------------------------------------------------------------------------
+
+
+class _Process:
+    """A process that runs pickled calls, one after the other. ``version``: of what it imports."""
+
+    def __init__(self) -> None:
+        # In a session of its own: Ctrl-C in the terminal reaches its parent only.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __name__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | SINGLE_THREADED,
+            start_new_session=True,
+        )
+
+    @cached_property
+    def version(self) -> Version:
+        """Raise EOFError if the process does not start."""
+        return pickle.loads(self._receive())
+
+    def answer(self, work: bytes) -> bytes:
+        """Return the pickled result of a call. Raise EOFError or OSError if the process ends."""
+        assert self._process.stdin is not None
+        pickle.dump(work, self._process.stdin)
+        self._process.stdin.flush()
+        return self._receive()
+
+    def _receive(self) -> bytes:
+        assert self._process.stdout is not None
+        try:
+            return pickle.load(self._process.stdout)
+        except pickle.UnpicklingError:  # cut
+            raise EOFError from None
+
+    def terminate(self) -> None:
+        self._process.terminate()
+
+    def end(self) -> int:
+        """End the process, kill it if it does not end, and return its status."""
+        try:
+            return self._process.wait(_SETTINGS.end_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()
+        finally:
+            for pipe in (self._process.stdin, self._process.stdout):
+                with suppress(OSError):
+                    assert pipe is not None
+                    pipe.close()
+
+
+class _Processes:
+    """The processes that run calls, one for each thread."""
+
+    def __init__(self) -> None:
+        self._of: dict[int, _Process] = {}
+        self._closed = False
+
+    def run(self, work: bytes, expected: Version, where: str = "this machine") -> bytes:
+        """Run a pickled call in the process of this thread; return its pickled result, Lost if its
+        process ends again and again, or ChaserdockError.
+        """
+        thread, status = threading.get_ident(), 0
+        for _ in range(_SETTINGS.attempts):
+            if self._closed:
+                break
+            process = self._of.get(thread) or self._of.setdefault(thread, _Process())
+            with suppress(EOFError, OSError):
+                if differs := difference(process.version, expected):
+                    return pickle.dumps(ChaserdockError(f"{where} has {differs}"))
+                return process.answer(work)
+            process.terminate()
+            status = process.end()
+            self._of.pop(thread, None)
+        why = " (killed, as when memory is short)" if status == -signal.SIGKILL else ""
+        return pickle.dumps(Lost(f"its process ended with status {status}{why}"))
+
+    def close(self) -> None:
+        """End all processes."""
+        self._closed = True
+        processes = list(self._of.values())
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.end()
+
+
+class _Pool:
+    """A pool of processes of this machine."""
+
+    def __init__(self, jobs: int, executor: Executor, processes: _Processes) -> None:
+        self._jobs, self._executor, self._processes = jobs, executor, processes
+
+    def room(self) -> int:
+        """Return how many calls to have in the pool."""
+        return self._jobs
+
+    def submit(self, work: bytes, expected: Version) -> Future[bytes]:
+        return self._executor.submit(self._processes.run, work, expected)
+
+    def result(self, future: Future[bytes]) -> object:
+        """Return the result of a call, or Lost. Raises ChaserdockError."""
+        return _opened(future.result())
+
+
+@contextmanager
+def _on_processes(jobs: int) -> Iterator[_Pool]:
+    processes = _Processes()
+    with ThreadPoolExecutor(jobs) as executor:
+        try:
+            yield _Pool(jobs, executor, processes)
+        finally:
+            processes.close()
+
+
+def _opened(answer: bytes) -> object:
+    """Return the result that a process has sent, or raise the error."""
+    result = pickle.loads(answer)
+    if isinstance(result, ChaserdockError):
+        raise result
+    return result
+
+
+def _main() -> None:
+    """Run the calls that arrive on standard input, until it is closed or none arrives for long.
+
+    What calls print goes to standard error.
+    """
+    signal.signal(signal.SIGTERM, _stop)
+    calls: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+
+    def read(arriving: BinaryIO) -> None:
+        with suppress(EOFError, pickle.UnpicklingError):
+            while True:
+                calls.put(pickle.load(arriving))
+        calls.put(None)
+        os.kill(os.getpid(), signal.SIGTERM)  # nobody waits for the result
+
+    # Copies, so that neither calls nor programs that they start read or write them.
+    arriving = os.fdopen(os.dup(0), "rb")
+    with os.fdopen(os.dup(1), "wb") as answers, open(os.devnull, "rb") as nothing:
+        os.dup2(nothing.fileno(), 0)
+        os.dup2(2, 1)
+
+        def answer(value: object) -> None:
+            pickle.dump(pickle.dumps(value), answers)
+            answers.flush()
+
+        answer(version())
+        threading.Thread(target=read, args=(arriving,), name="calls", daemon=True).start()
+        with suppress(queue.Empty):
+            while (work := calls.get(timeout=_SETTINGS.idle_s)) is not None:
+                try:
+                    call, item = pickle.loads(work)
+                    answer(call(item))
+                except ChaserdockError as error:
+                    answer(ChaserdockError(str(error)))  # not all kinds can be pickled
+
+
+def _stop(*_: object) -> None:
+    """End this process by an exception, so that a call removes its files; once, as they remain if
+    another one meets that.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.exit(STOPPED)
+
+
+# -- Dask ------------------------------------------------------------------------------------------
+
+_ON_WORKER = _Processes()
+"""Processes of a Dask worker, which they outlive by the end of a call at most."""
+
+
+def run_on_worker(work: bytes, expected: Version) -> bytes:
+    """Run a pickled call on the Dask worker that this is."""
+    from distributed import get_worker
+
+    return _ON_WORKER.run(work, expected, f"worker {get_worker().address}")
+
+
+class _Cluster:
+    """The workers of a Dask scheduler."""
+
+    def __init__(self, address: str, client: Any) -> None:
+        self._address, self._client = address, client
+        # pure=False: Dask must not take the result of an equal call.
+        self._executor = client.get_executor(pure=False)
+
+    def room(self) -> int:
+        """Return how many calls to have on the cluster; one waits for the first worker."""
+        with self._errors():
+            return max(1, round(_SETTINGS.ahead * sum(self._client.nthreads().values())))
+
+    def submit(self, work: bytes, expected: Version) -> Future[bytes]:
+        with self._errors():
+            return self._executor.submit(run_on_worker, work, expected)
+
+    def result(self, future: Future[bytes]) -> object:
+        """Return the result of a call, or Lost. Raises ChaserdockError."""
+        from distributed import KilledWorker
+
+        try:
+            with self._errors():
+                return _opened(future.result())
+        except KilledWorker as error:
+            workers, last = error.allowed_failures + 1, error.last_worker.address
+            return Lost(f"{workers} workers ended while they ran it, the last one {last}")
+        except ChaserdockError as error:
+            raise ChaserdockError(f"--cluster {self._address}: {error}") from None
+        except Exception as error:
+            self.refuse_others()  # such as one that has joined without chaserdock
+            raise ChaserdockError(
+                f"--cluster {self._address}: a worker could not run a call: "
+                f"{type(error).__name__}: {error}"
+            ) from error
+
+    def refuse_others(self) -> None:
+        """Raise ChaserdockError if a worker has not what this process has."""
+        expected = version()
+        with self._errors():
+            found = self._client.run(version, on_error="return")
+        for worker, theirs in found.items():
+            if isinstance(theirs, Exception):
+                differs = f"no chaserdock of this version ({theirs}), here {expected['chaserdock']}"
+            else:
+                differs = difference(theirs, expected)
+            if differs:
+                raise ChaserdockError(f"--cluster {self._address}: worker {worker} has {differs}")
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Raise ChaserdockError if the scheduler is lost."""
+        try:
+            yield
+        except (OSError, TimeoutError, CancelledError) as error:
+            raise ChaserdockError(
+                f"the scheduler is lost ({type(error).__name__}); repeat the command once it "
+                "answers again"
+            ) from None
+
+
+@contextmanager
+def _on_cluster(address: str) -> Iterator[_Cluster]:
+    """Yield the cluster at an address, all of whose workers are as this process.
+
+    Raises ChaserdockError, and MissingPackageError without Dask.
+    """
+    require_extra("distributed", "cluster")
+    from distributed import Client
+
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what concerns users is raised
+    with ExitStack() as stack:
+        try:
+            client: Any = stack.enter_context(Client(address, timeout=_SETTINGS.connect_s))
+        except (OSError, ValueError, TimeoutError) as error:
+            raise ChaserdockError(
+                f"--cluster {address}: no Dask scheduler answers: {error}"
+            ) from None
+        cluster = _Cluster(address, client)
+        cluster.refuse_others()
+        yield cluster
+
+
+if __name__ == "__main__":
+    _main()

@@ -16,7 +16,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+import traceback
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
@@ -56,7 +57,9 @@ HERE = Places()
 
 @dataclass(frozen=True)
 class Lost:
-    """A call without a result: whatever ran it ended, for this ``reason``."""
+    """A call without a result, and the reason: it raised an exception, of which its process printed
+    the traceback, or ended each process that ran it.
+    """
 
     reason: str
 
@@ -79,7 +82,7 @@ def spread(
     items: Iterable[T],
     places: Places = HERE,
     stop: Callable[[], bool] = lambda: False,
-) -> Iterator[tuple[T, R | Lost]]:
+) -> Generator[tuple[T, R | Lost], None, None]:
     """Yield each item with the result of its call, as they end. Begin none once ``stop()``.
 
     ``call`` and its items must be importable elsewhere and are pickled, but for one job on this
@@ -119,7 +122,7 @@ class _Process:
     def __init__(self) -> None:
         # In a session of its own: Ctrl-C in the terminal reaches its parent only.
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__],
+            [sys.executable, "-c", f"from {__name__} import main; main()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ | SINGLE_THREADED,
@@ -170,8 +173,8 @@ class _Processes:
         self._closed = False
 
     def run(self, work: bytes, expected: Version, where: str = "this machine") -> bytes:
-        """Run a pickled call in the process of this thread; return its pickled result, Lost if its
-        process ends again and again, or ChaserdockError.
+        """Run a pickled call in the process of this thread; return its pickled result, Lost or
+        ChaserdockError.
         """
         thread, status = threading.get_ident(), 0
         for _ in range(_SETTINGS.attempts):
@@ -234,7 +237,7 @@ def _opened(answer: bytes) -> object:
     return result
 
 
-def _main() -> None:
+def main() -> None:
     """Run the calls that arrive on standard input, until it is closed or none arrives for long.
 
     What calls print goes to standard error.
@@ -268,6 +271,9 @@ def _main() -> None:
                     answer(call(item))
                 except ChaserdockError as error:
                     answer(ChaserdockError(str(error)))  # not all kinds can be pickled
+                except Exception as error:
+                    traceback.print_exc()
+                    answer(Lost(f"{type(error).__name__}: {error}"))
 
 
 def _stop(*_: object) -> None:
@@ -373,7 +379,3 @@ def _on_cluster(address: str) -> Iterator[_Cluster]:
         cluster = _Cluster(address, client)
         cluster.refuse_others()
         yield cluster
-
-
-if __name__ == "__main__":
-    _main()

@@ -283,7 +283,7 @@ def test_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.Mon
     campaign = campaign_of(GRID, tmp_path)
     flown: list[str] = []
 
-    def fly(flight: Any, *_: Any) -> FlightOutcome:
+    def fly(flight: Any, **_: Any) -> FlightOutcome:
         flown.append(flight.name)
         return FlightOutcome(flight.name, 0, summary([]), "")
 
@@ -295,7 +295,7 @@ def test_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.Mon
     outcomes = fly_plan(
         campaign,
         tmp_path,
-        Workers(2),
+        Workers(),
         lambda ended, total, flight, outcome: progress.append(ended),
         threading.Event(),
     )
@@ -315,7 +315,7 @@ def test_result_of_other_code_is_flown_again_after_what_has_none(
     write_result(tmp_path, FlightOutcome(flights[1].name, 0, summary([]), "", None, None, "new"))
     flown: list[str] = []
 
-    def fly(flight: Any, *_: Any) -> FlightOutcome:
+    def fly(flight: Any, **_: Any) -> FlightOutcome:
         flown.append(flight.name)
         return FlightOutcome(flight.name, 0, summary([]), "", None, None, flight.code)
 

@@ -34,7 +34,7 @@ from typing import Any, BinaryIO, TypeVar, cast
 from chaserdock_protocol.errors import ChaserdockError, require_extra
 from chaserdock_protocol.process import SINGLE_THREADED
 
-from chaserdock.exit_codes import STOPPED
+from chaserdock.launch.signals import interrupts
 from chaserdock.version import Version, difference, version
 
 T = TypeVar("T")
@@ -148,21 +148,22 @@ class _Process:
         except pickle.UnpicklingError:  # cut
             raise EOFError from None
 
-    def terminate(self) -> None:
-        self._process.terminate()
+    def stop(self) -> None:
+        """Let the process end its call now: its input ends."""
+        with suppress(OSError):
+            assert self._process.stdin is not None
+            self._process.stdin.close()
 
     def end(self) -> int:
-        """End the process, kill it if it does not end, and return its status."""
+        """Wait for a process that was stopped, kill it if it does not end; return its status."""
         try:
             return self._process.wait(_SETTINGS.end_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
             return self._process.wait()
         finally:
-            for pipe in (self._process.stdin, self._process.stdout):
-                with suppress(OSError):
-                    assert pipe is not None
-                    pipe.close()
+            assert self._process.stdout is not None
+            self._process.stdout.close()
 
 
 class _Processes:
@@ -185,7 +186,7 @@ class _Processes:
                 if differs := difference(process.version, expected):
                     return pickle.dumps(ChaserdockError(f"{where} has {differs}"))
                 return process.answer(work)
-            process.terminate()
+            process.stop()
             status = process.end()
             self._of.pop(thread, None)
         why = " (killed, as when memory is short)" if status == -signal.SIGKILL else ""
@@ -196,7 +197,7 @@ class _Processes:
         self._closed = True
         processes = list(self._of.values())
         for process in processes:
-            process.terminate()
+            process.stop()
         for process in processes:
             process.end()
 
@@ -242,7 +243,6 @@ def main() -> None:
 
     What calls print goes to standard error.
     """
-    signal.signal(signal.SIGTERM, _stop)
     calls: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
 
     def read(arriving: BinaryIO) -> None:
@@ -254,34 +254,31 @@ def main() -> None:
 
     # Copies, so that neither calls nor programs that they start read or write them.
     arriving = os.fdopen(os.dup(0), "rb")
-    with os.fdopen(os.dup(1), "wb") as answers, open(os.devnull, "rb") as nothing:
+    with (
+        suppress(queue.Empty, KeyboardInterrupt, BrokenPipeError),
+        interrupts(),  # as an exception: a call removes its files
+        os.fdopen(os.dup(1), "wb") as answers,
+        open(os.devnull, "rb") as nothing,
+    ):
         os.dup2(nothing.fileno(), 0)
         os.dup2(2, 1)
 
-        def answer(value: object) -> None:
-            pickle.dump(pickle.dumps(value), answers)
+        def answer(result: bytes) -> None:
+            pickle.dump(result, answers)
             answers.flush()
 
-        answer(version())
+        answer(pickle.dumps(version()))
         threading.Thread(target=read, args=(arriving,), name="calls", daemon=True).start()
-        with suppress(queue.Empty):
-            while (work := calls.get(timeout=_SETTINGS.idle_s)) is not None:
-                try:
-                    call, item = pickle.loads(work)
-                    answer(call(item))
-                except ChaserdockError as error:
-                    answer(ChaserdockError(str(error)))  # not all kinds can be pickled
-                except Exception as error:
-                    traceback.print_exc()
-                    answer(Lost(f"{type(error).__name__}: {error}"))
-
-
-def _stop(*_: object) -> None:
-    """End this process by an exception, so that a call removes its files; once, as they remain if
-    another one meets that.
-    """
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    sys.exit(STOPPED)
+        while (work := calls.get(timeout=_SETTINGS.idle_s)) is not None:
+            try:
+                call, item = pickle.loads(work)
+                result = pickle.dumps(call(item))
+            except ChaserdockError as error:
+                result = pickle.dumps(ChaserdockError(str(error)))  # not all kinds can be pickled
+            except Exception as error:
+                traceback.print_exc()
+                result = pickle.dumps(Lost(f"{type(error).__name__}: {error}"))
+            answer(result)
 
 
 # -- Dask ------------------------------------------------------------------------------------------

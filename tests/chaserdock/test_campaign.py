@@ -6,7 +6,6 @@ from __future__ import annotations
 import html
 import json
 import math
-import os
 import re
 import signal
 import subprocess
@@ -453,7 +452,6 @@ def test_table_is_equal_after_kill_and_resume_and_on_a_cluster(tmp_path: Path) -
 
     from distributed import LocalCluster
 
-    os.environ.setdefault("DASK_DISTRIBUTED__WORKER__DAEMON", "False")
     cluster: Any = LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=""
     )

@@ -103,25 +103,25 @@ def simulate(
     flown: list[SimulationResult] = []
     outcomes: Counter[str] = Counter()
     written: list[Path] = []
-    stopped = False
+    chosen, stopped = _seed_range(seeds), False
 
     try:
-        for result in _fly(options, _seed_range(seeds), Places(jobs, cluster), results):
-            outcomes["not flown" if isinstance(result, UnflownSeed) else result.outcome] += 1
-            if isinstance(result, UnflownSeed):
-                print(f"seed {result.seed}: not flown: {result.reason}", flush=True)
-                continue
-            flown.append(result)
-            for violation in result.violations:
-                print(f"seed {result.seed}: {violation}", flush=True)
-            if stop and result.violations:
-                break
+        for result in _fly(options, chosen, Places(jobs, cluster), results):
+            flew = not isinstance(result, UnflownSeed)
+            outcomes[result.outcome if flew else "not flown"] += 1
+            _print_seed(result, f"{outcomes.total()}/{len(chosen)}")
+            if flew:
+                flown.append(result)
+                if stop and result.violations:
+                    break
         # Only now, as processes elsewhere would wait.
         for result in flown:
             if shrinking and result.violations:
                 _shrink(result, out, written)
     except KeyboardInterrupt:
         stopped = True
+        if results is not None:
+            print("chaserdock: stopped; repeat the command to resume", file=sys.stderr)
 
     failed = _print_end(options, outcomes, flown, written, time.monotonic() - begin_s)
     raise typer.Exit(STOPPED if stopped else FAILED if failed else DONE)
@@ -149,6 +149,17 @@ def _fly(
             if not isinstance(result, UnflownSeed):
                 table.add(result)
             yield result
+
+
+def _print_seed(result: SimulationResult | UnflownSeed, done: str) -> None:
+    """Print why a seed failed, and on a terminal how many are ``done``."""
+    from chaserdock.simulation.seeds import UnflownSeed
+
+    if sys.stderr.isatty():
+        print(f"\033[K{done}\r", end="", file=sys.stderr, flush=True)
+    unflown = isinstance(result, UnflownSeed)
+    for text in [f"not flown: {result.reason}"] if unflown else result.violations:
+        print(f"seed {result.seed}: {text}", flush=True)
 
 
 def _print_end(

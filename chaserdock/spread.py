@@ -148,6 +148,9 @@ class _Process:
         except pickle.UnpicklingError:  # cut
             raise EOFError from None
 
+    def has_ended(self) -> bool:
+        return self._process.poll() is not None
+
     def stop(self) -> None:
         """Let the process end its call now: its input ends."""
         with suppress(OSError):
@@ -171,31 +174,40 @@ class _Processes:
 
     def __init__(self) -> None:
         self._of: dict[int, _Process] = {}
-        self._closed = False
+        self._lock, self._closed = threading.Lock(), False
 
     def run(self, work: bytes, expected: Version, where: str = "this machine") -> bytes:
         """Run a pickled call in the process of this thread; return its pickled result, Lost or
         ChaserdockError.
         """
-        thread, status = threading.get_ident(), 0
+        status = 0
         for _ in range(_SETTINGS.attempts):
-            if self._closed:
+            if (process := self._mine()) is None:
                 break
-            process = self._of.get(thread) or self._of.setdefault(thread, _Process())
             with suppress(EOFError, OSError):
                 if differs := difference(process.version, expected):
                     return pickle.dumps(ChaserdockError(f"{where} has {differs}"))
                 return process.answer(work)
             process.stop()
             status = process.end()
-            self._of.pop(thread, None)
         why = " (killed, as when memory is short)" if status == -signal.SIGKILL else ""
         return pickle.dumps(Lost(f"its process ended with status {status}{why}"))
 
+    def _mine(self) -> _Process | None:
+        """Return the process of this thread, a new one if it has ended; None once closed."""
+        thread = threading.get_ident()
+        with self._lock:
+            if self._closed:
+                return None
+            if thread not in self._of or self._of[thread].has_ended():
+                self._of[thread] = _Process()
+            return self._of[thread]
+
     def close(self) -> None:
         """End all processes."""
-        self._closed = True
-        processes = list(self._of.values())
+        with self._lock:
+            self._closed = True
+        processes = self._of.values()
         for process in processes:
             process.stop()
         for process in processes:

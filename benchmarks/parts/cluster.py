@@ -29,6 +29,7 @@ from common import (
 )
 
 from chaserdock.exit_codes import DONE, FAILED
+from chaserdock.launch.signals import interrupts
 from chaserdock.simulation.flight import SimulationResult
 from chaserdock.simulation.seed_table import opened_table
 from chaserdock.simulation.seeds import SeedOptions, fly_seed
@@ -105,9 +106,9 @@ class Cluster:
         return sum(self._used.values())
 
     def close(self) -> None:
-        """End all processes."""
+        """End all processes at once: a worker without its scheduler would wait for it."""
         for process in self._processes.values():
-            process.terminate()
+            process.kill()
         for process in self._processes.values():
             process.wait()
         self._log.close()
@@ -156,7 +157,7 @@ def on_cluster(options: Options) -> Figures:
     equal to a flight in this process, of which a few are made.
     """
     seeds, draw = seeds_of(options, 10_000, 20), random.Random(options.first)
-    with tempfile.TemporaryDirectory(prefix="chaserdock-cluster-") as name:
+    with interrupts(), tempfile.TemporaryDirectory(prefix="chaserdock-cluster-") as name:
         folder, kills = Path(name), Counter[str]()
         table = (options.results or folder / "seeds.jsonl").absolute()
         before = results_in(table)

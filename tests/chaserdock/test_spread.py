@@ -179,7 +179,7 @@ def cluster_of(workers: int) -> Iterator[Any]:
     from distributed import LocalCluster
 
     cluster: Any = LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=""
+        n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0"
     )
     with cluster:
         yield cluster

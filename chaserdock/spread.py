@@ -3,14 +3,13 @@
 
 Each call runs in a process that runs nothing else meanwhile, also on a worker with several threads.
 A process that has ended is replaced, and its call is repeated. A process whose chaserdock, Python
-or packages are others than here runs no call.
+or packages are others than here runs no call. Calls and results travel as JSON, a line each.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import pickle
 import queue
 import signal
 import subprocess
@@ -29,8 +28,9 @@ from concurrent.futures import (
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, BinaryIO, TypeVar, cast
+from typing import Any, BinaryIO, Generic, TypeVar
 
+import msgspec
 from chaserdock_protocol.errors import ChaserdockError, require_extra
 from chaserdock_protocol.process import SINGLE_THREADED
 
@@ -57,11 +57,32 @@ HERE = Places()
 
 @dataclass(frozen=True)
 class Lost:
-    """A call without a result, and the reason: it raised an exception, of which its process printed
-    the traceback, or ended each process that ran it.
+    """A call without a result, and the reason: what it returned in place of one, an exception, of
+    which its process printed the traceback, or that it ended each process that ran it.
     """
 
     reason: str
+
+
+@dataclass(frozen=True)
+class ServedCall(Generic[T, R]):
+    """A function that other processes can call: ``python -m MODULE`` serves it (``serve``).
+
+    ``takes``, ``gives``: types of its argument and its result, which msgspec can encode.
+    """
+
+    module: str
+    call: Callable[[T], R | Lost]
+    takes: type[T]
+    gives: type[R]
+
+
+class _Answer(msgspec.Struct, omit_defaults=True):
+    """The end of a call: its result, why it was lost, or the error that ends all calls."""
+
+    result: msgspec.Raw = msgspec.Raw()
+    lost: str | None = None
+    error: str | None = None
 
 
 @dataclass(frozen=True)
@@ -78,22 +99,21 @@ _SETTINGS = _Settings()
 
 
 def spread(
-    call: Callable[[T], R],
+    task: ServedCall[T, R],
     items: Iterable[T],
     places: Places = HERE,
     stop: Callable[[], bool] = lambda: False,
 ) -> Generator[tuple[T, R | Lost], None, None]:
     """Yield each item with the result of its call, as they end. Begin none once ``stop()``.
 
-    ``call`` and its items must be importable elsewhere and are pickled, but for one job on this
-    machine, which runs in this process. Processes of this machine end when the generator does.
-    Raises ChaserdockError, as a call does, or if a worker is not as this process.
+    One job on this machine runs in this process. Other processes of this machine end when the
+    generator does. Raises ChaserdockError, as a call does, or if a worker is not as this process.
     """
     if places.cluster is None and places.jobs == 1:
         for item in items:
             if stop():
                 return
-            yield item, call(item)
+            yield item, task.call(item)
         return
     expected, waiting = version(), iter(items)
     with _on_cluster(places.cluster) if places.cluster else _on_processes(places.jobs) as pool:
@@ -101,11 +121,12 @@ def spread(
         while True:
             room = pool.room() - len(active)
             for item in () if stop() else _first(waiting, room):
-                active[pool.submit(pickle.dumps((call, item)), expected)] = item
+                call = msgspec.json.encode(item)
+                active[pool.submit(task.module, call, expected)] = item
             if not active:
                 return
             for future in wait(active, _SETTINGS.look_s, FIRST_COMPLETED).done:
-                yield active.pop(future), cast("R | Lost", pool.result(future))
+                yield active.pop(future), _opened(pool.answer(future), task, places)
 
 
 def _first(items: Iterator[T], number: int) -> Iterator[T]:
@@ -113,16 +134,74 @@ def _first(items: Iterator[T], number: int) -> Iterator[T]:
         yield item
 
 
-# -- Processes -------------------------------------------------------------------------------------
+def _opened(line: bytes, task: ServedCall[Any, R], places: Places) -> R | Lost:
+    """Return the result in an answer. Raises the error in it."""
+    answer = msgspec.json.decode(line, type=_Answer)
+    if answer.error is not None:
+        where = f"--cluster {places.cluster}: " if places.cluster else ""
+        raise ChaserdockError(where + answer.error)
+    if answer.lost is not None:
+        return Lost(answer.lost)
+    return msgspec.json.decode(answer.result, type=task.gives)
+
+
+# -- The process of a call -------------------------------------------------------------------------
+
+
+def serve(task: ServedCall[Any, Any]) -> None:
+    """Answer the calls that arrive on standard input, until it is closed or none arrives for long.
+
+    What calls print goes to standard error.
+    """
+    calls: queue.Queue[bytes] = queue.Queue(maxsize=1)
+
+    def read(arriving: BinaryIO) -> None:
+        for line in arriving:
+            calls.put(line)
+        calls.put(b"")
+        os.kill(os.getpid(), signal.SIGTERM)  # nobody waits for the result
+
+    # Copies, so that neither calls nor programs that they start read or write them.
+    arriving = os.fdopen(os.dup(0), "rb")
+    with (
+        suppress(queue.Empty, KeyboardInterrupt, BrokenPipeError),
+        interrupts(),  # as an exception: a call removes its files
+        os.fdopen(os.dup(1), "wb") as answers,
+        open(os.devnull, "rb") as nothing,
+    ):
+        os.dup2(nothing.fileno(), 0)
+        os.dup2(2, 1)
+        answers.write(msgspec.json.encode(version()) + b"\n")
+        answers.flush()
+        threading.Thread(target=read, args=(arriving,), name="calls", daemon=True).start()
+        while line := calls.get(timeout=_SETTINGS.idle_s):
+            answers.write(msgspec.json.encode(_answer(task, line)) + b"\n")
+            answers.flush()
+
+
+def _answer(task: ServedCall[Any, Any], line: bytes) -> _Answer:
+    try:
+        result = task.call(msgspec.json.decode(line, type=task.takes))
+        if isinstance(result, Lost):
+            return _Answer(lost=result.reason)
+        return _Answer(msgspec.Raw(msgspec.json.encode(result)))
+    except ChaserdockError as error:
+        return _Answer(error=str(error))
+    except Exception as error:
+        traceback.print_exc()
+        return _Answer(lost=f"{type(error).__name__}: {error}")
 
 
 class _Process:
-    """A process that runs pickled calls, one after the other. ``version``: of what it imports."""
+    """A process that serves calls of a module, one after the other. ``version``: of what it
+    imports.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, module: str) -> None:
+        self.module = module
         # In a session of its own: Ctrl-C in the terminal reaches its parent only.
         self._process = subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import main; main()"],
+            [sys.executable, "-m", module],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ | SINGLE_THREADED,
@@ -132,21 +211,21 @@ class _Process:
     @cached_property
     def version(self) -> Version:
         """Raise EOFError if the process does not start."""
-        return pickle.loads(self._receive())
+        return msgspec.json.decode(self._receive(), type=Version)
 
-    def answer(self, work: bytes) -> bytes:
-        """Return the pickled result of a call. Raise EOFError or OSError if the process ends."""
+    def answer(self, call: bytes) -> bytes:
+        """Return the answer to a call. Raise EOFError or OSError if the process ends."""
         assert self._process.stdin is not None
-        pickle.dump(work, self._process.stdin)
+        self._process.stdin.write(call + b"\n")
         self._process.stdin.flush()
         return self._receive()
 
     def _receive(self) -> bytes:
         assert self._process.stdout is not None
-        try:
-            return pickle.load(self._process.stdout)
-        except pickle.UnpicklingError:  # cut
-            raise EOFError from None
+        line = self._process.stdout.readline()
+        if not line.endswith(b"\n"):
+            raise EOFError
+        return line
 
     def has_ended(self) -> bool:
         return self._process.poll() is not None
@@ -176,41 +255,46 @@ class _Processes:
         self._of: dict[int, _Process] = {}
         self._lock, self._closed = threading.Lock(), False
 
-    def run(self, work: bytes, expected: Version, where: str = "this machine") -> bytes:
-        """Run a pickled call in the process of this thread; return its pickled result, Lost or
-        ChaserdockError.
-        """
+    def run(
+        self, module: str, call: bytes, expected: Version, where: str = "this machine"
+    ) -> bytes:
+        """Run a call in the process of this thread; return its answer."""
         status = 0
         for _ in range(_SETTINGS.attempts):
-            if (process := self._mine()) is None:
+            if (process := self._mine(module)) is None:
                 break
             with suppress(EOFError, OSError):
                 if differs := difference(process.version, expected):
-                    return pickle.dumps(ChaserdockError(f"{where} has {differs}"))
-                return process.answer(work)
+                    return msgspec.json.encode(_Answer(error=f"{where} has {differs}"))
+                return process.answer(call)
             process.stop()
             status = process.end()
         why = " (killed, as when memory is short)" if status == -signal.SIGKILL else ""
-        return pickle.dumps(Lost(f"its process ended with status {status}{why}"))
+        lost = f"its process ended with status {status}{why}"
+        return msgspec.json.encode(_Answer(lost=lost))
 
-    def _mine(self) -> _Process | None:
-        """Return the process of this thread, a new one if it has ended; None once closed."""
+    def _mine(self, module: str) -> _Process | None:
+        """Return the process of this thread, a new one if it has ended or serves another module;
+        None once closed.
+        """
         thread = threading.get_ident()
         with self._lock:
             if self._closed:
                 return None
-            if thread not in self._of or self._of[thread].has_ended():
-                self._of[thread] = _Process()
-            return self._of[thread]
+            process = self._of.get(thread)
+            if process is not None and process.module != module:
+                process.stop()
+            if process is None or process.has_ended() or process.module != module:
+                self._of[thread] = process = _Process(module)
+            return process
 
     def close(self) -> None:
         """End all processes."""
         with self._lock:
             self._closed = True
-        processes = self._of.values()
-        for process in processes:
+        for process in self._of.values():
             process.stop()
-        for process in processes:
+        for process in self._of.values():
             process.end()
 
 
@@ -224,12 +308,12 @@ class _Pool:
         """Return how many calls to have in the pool."""
         return self._jobs
 
-    def submit(self, work: bytes, expected: Version) -> Future[bytes]:
-        return self._executor.submit(self._processes.run, work, expected)
+    def submit(self, module: str, call: bytes, expected: Version) -> Future[bytes]:
+        return self._executor.submit(self._processes.run, module, call, expected)
 
-    def result(self, future: Future[bytes]) -> object:
-        """Return the result of a call, or Lost. Raises ChaserdockError."""
-        return _opened(future.result())
+    def answer(self, future: Future[bytes]) -> bytes:
+        """Return the answer to a call that has ended."""
+        return future.result()
 
 
 @contextmanager
@@ -242,68 +326,17 @@ def _on_processes(jobs: int) -> Iterator[_Pool]:
             processes.close()
 
 
-def _opened(answer: bytes) -> object:
-    """Return the result that a process has sent, or raise the error."""
-    result = pickle.loads(answer)
-    if isinstance(result, ChaserdockError):
-        raise result
-    return result
-
-
-def main() -> None:
-    """Run the calls that arrive on standard input, until it is closed or none arrives for long.
-
-    What calls print goes to standard error.
-    """
-    calls: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-
-    def read(arriving: BinaryIO) -> None:
-        with suppress(EOFError, pickle.UnpicklingError):
-            while True:
-                calls.put(pickle.load(arriving))
-        calls.put(None)
-        os.kill(os.getpid(), signal.SIGTERM)  # nobody waits for the result
-
-    # Copies, so that neither calls nor programs that they start read or write them.
-    arriving = os.fdopen(os.dup(0), "rb")
-    with (
-        suppress(queue.Empty, KeyboardInterrupt, BrokenPipeError),
-        interrupts(),  # as an exception: a call removes its files
-        os.fdopen(os.dup(1), "wb") as answers,
-        open(os.devnull, "rb") as nothing,
-    ):
-        os.dup2(nothing.fileno(), 0)
-        os.dup2(2, 1)
-
-        def answer(result: bytes) -> None:
-            pickle.dump(result, answers)
-            answers.flush()
-
-        answer(pickle.dumps(version()))
-        threading.Thread(target=read, args=(arriving,), name="calls", daemon=True).start()
-        while (work := calls.get(timeout=_SETTINGS.idle_s)) is not None:
-            try:
-                call, item = pickle.loads(work)
-                result = pickle.dumps(call(item))
-            except ChaserdockError as error:
-                result = pickle.dumps(ChaserdockError(str(error)))  # not all kinds can be pickled
-            except Exception as error:
-                traceback.print_exc()
-                result = pickle.dumps(Lost(f"{type(error).__name__}: {error}"))
-            answer(result)
-
-
 # -- Dask ------------------------------------------------------------------------------------------
 
 _ON_WORKER = _Processes()
 """Processes of a Dask worker, which they outlive by the end of a call at most."""
 
 
-def run_on_worker(work: bytes, expected: Version) -> bytes:
-    """Run a pickled call on the Dask worker that this is."""
+def run_on_worker(module: str, call: bytes, expected: Version) -> bytes:
+    """Run a call on the Dask worker that this is."""
     from distributed import get_worker
 
-    return _ON_WORKER.run(work, expected, f"worker {get_worker().address}")
+    return _ON_WORKER.run(module, call, expected, f"worker {get_worker().address}")
 
 
 class _Cluster:
@@ -319,22 +352,23 @@ class _Cluster:
         with self._errors():
             return max(1, round(_SETTINGS.ahead * sum(self._client.nthreads().values())))
 
-    def submit(self, work: bytes, expected: Version) -> Future[bytes]:
+    def submit(self, module: str, call: bytes, expected: Version) -> Future[bytes]:
         with self._errors():
-            return self._executor.submit(run_on_worker, work, expected)
+            return self._executor.submit(run_on_worker, module, call, expected)
 
-    def result(self, future: Future[bytes]) -> object:
-        """Return the result of a call, or Lost. Raises ChaserdockError."""
+    def answer(self, future: Future[bytes]) -> bytes:
+        """Return the answer to a call that has ended. Raises ChaserdockError."""
         from distributed import KilledWorker
 
         try:
             with self._errors():
-                return _opened(future.result())
+                return future.result()
         except KilledWorker as error:
             workers, last = error.allowed_failures + 1, error.last_worker.address
-            return Lost(f"{workers} workers ended while they ran it, the last one {last}")
-        except ChaserdockError as error:
-            raise ChaserdockError(f"--cluster {self._address}: {error}") from None
+            lost = f"{workers} workers ended while they ran it, the last one {last}"
+            return msgspec.json.encode(_Answer(lost=lost))
+        except ChaserdockError:
+            raise
         except Exception as error:
             self.refuse_others()  # such as one that has joined without chaserdock
             raise ChaserdockError(
@@ -362,8 +396,8 @@ class _Cluster:
             yield
         except (OSError, TimeoutError, CancelledError) as error:
             raise ChaserdockError(
-                f"the scheduler is lost ({type(error).__name__}); repeat the command once it "
-                "answers again"
+                f"--cluster {self._address}: the scheduler is lost ({type(error).__name__}); "
+                "repeat the command once it answers again"
             ) from None
 
 

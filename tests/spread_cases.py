@@ -1,36 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls that other processes import, for tests of spreading."""
+"""Calls that other processes serve, for tests of spreading: ``python -m spread_cases``."""
 
 from __future__ import annotations
 
+import math
 import os
+import signal
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from chaserdock.simulation.flight import SimulationResult
-    from chaserdock.simulation.seeds import SeedOptions
+import msgspec
+from chaserdock_protocol.shipped_scenarios import find_scenario
 
-REAL_SEEDS = (1, 2)
-"""Seeds that ``fly`` really flies."""
+from chaserdock.spread import Lost, ServedCall, serve
 
 
-def fly(options: SeedOptions, digest: str, seed: int) -> SimulationResult:
-    """Fly a seed, most of them in 50 ms of wall time and to a result that tells nothing else."""
-    from chaserdock.simulation.flight import SimulationResult
-    from chaserdock.simulation.seeds import fly_seed
+class Case(msgspec.Struct, frozen=True):
+    """A call: what to do, and the number, or path, to do it with."""
 
-    if seed in REAL_SEEDS:
-        return fly_seed(options, seed)
-    time.sleep(0.05)
-    return SimulationResult(seed, {"extends": options.scenario}, (), "docked", digest, {}, 1.0)
+    what: str
+    number: float = 0.0
+    path: str = ""
 
 
-def die_once(marks: Path, item: int) -> int:
-    """Return an item; at the first call with it, end the process by the status that it states."""
-    mark = marks / str(item)
-    if item and not mark.exists():
-        mark.touch()
-        os._exit(item)
-    return item
+def run(case: Case) -> float | Lost:
+    """Do it; return the square root of the number."""
+    match case.what:
+        case "sleep":
+            time.sleep(case.number)
+        case "lose":
+            return Lost("lost")
+        case "refuse":
+            find_scenario("nowhere")
+        case "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        case "exit once" if not Path(case.path).exists():
+            Path(case.path).touch()
+            os._exit(3)
+    return math.sqrt(case.number)
+
+
+TASK = ServedCall("spread_cases", run, Case, float)
+
+
+if __name__ == "__main__":
+    serve(TASK)

@@ -18,7 +18,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,7 +28,7 @@ from chaserdock_protocol.recording.scan import LOG_NAME
 from msgspec import Struct
 
 from chaserdock.exit_codes import FAILED
-from chaserdock.spread import Lost, Places, spread
+from chaserdock.spread import Lost, Places, ServedCall, serve, spread
 from chaserdock.terminal import wrapped
 from chaserdock.verdict import verdict_of
 
@@ -82,15 +81,31 @@ def fly_plan(
     remaining = [f for f in plan.flights if f.name not in outcomes]
     remaining += [f for f in plan.flights if f.name in outcomes and outcomes[f.name].code != f.code]
     left = len(remaining)
-    call = partial(fly, keep=workers.keep, logs=folder / "runs")
-    for flight, flown in spread(call, remaining, workers, stop.is_set):
-        lost = isinstance(flown, Lost)
-        outcome = FlightOutcome(flight.name, FAILED, None, flown.reason) if lost else flown
+    calls = (_Call(flight, workers.keep, str(folder / "runs")) for flight in remaining)
+    for call, flown in spread(_FLY, calls, workers, stop.is_set):
+        flight, outcome = call.flight, flown
+        if isinstance(outcome, Lost):
+            outcome = FlightOutcome(flight.name, FAILED, None, outcome.reason)
         write_result(folder, outcome)
         outcomes[flight.name] = outcome
         left -= 1
         report(len(plan.flights) - left, len(plan.flights), flight, outcome)
     return {f.name: outcomes[f.name] for f in plan.flights if f.name in outcomes}
+
+
+class _Call(Struct, frozen=True):
+    """A flight to fly, perhaps on another machine."""
+
+    flight: PlannedFlight
+    keep: Keep
+    logs: str
+
+
+def _fly(call: _Call) -> FlightOutcome:
+    return fly(call.flight, call.keep, Path(call.logs))
+
+
+_FLY = ServedCall("chaserdock.experiments.worker", _fly, _Call, FlightOutcome)
 
 
 def results_of(plan: ExperimentPlan, folder: Path) -> dict[str, FlightOutcome]:
@@ -131,9 +146,8 @@ def write_result(folder: Path, outcome: FlightOutcome) -> None:
 def fly(flight: PlannedFlight, keep: Keep, logs: Path) -> FlightOutcome:
     """Fly one flight in a temporary folder. Move its log to ``logs`` if ``keep`` asks for it.
 
-    Also on other machines, therefore arguments and result are plain values. If ``logs`` is not
-    writable (no shared disk), a kept log stays on the worker's machine and the result names host
-    and path.
+    If ``logs`` is not writable (no shared disk), a kept log stays on the worker's machine and the
+    result names host and path.
     """
     folder = Path(tempfile.mkdtemp(prefix=f"chaserdock-{flight.name}-"))
     try:
@@ -202,3 +216,7 @@ class ExperimentProgress:
         varied = ", ".join(f"{name}={value}" for name, value in flight.varied.items())
         label = flight.label + (f" ({varied})" if varied else "")
         print("\n".join(wrapped([f"{ended}/{total} {label}: {verdict}{left}"])), flush=True)
+
+
+if __name__ == "__main__":
+    serve(_FLY)

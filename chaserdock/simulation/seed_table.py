@@ -14,44 +14,14 @@ from chaserdock_protocol.errors import ChaserdockError, errors_of_writing
 
 from chaserdock.version import digest_of, version
 
-from .checks.check import Violation
-from .checks.estimates import NEES
-from .checks.tracking import TRACKING
 from .flight import SimulationResult
 from .seeds import SeedOptions, flown_digest
-from .swarm import Case
-
-_EXPECTATIONS = {expected.name: expected for expected in (NEES, TRACKING)}
 
 
-class SeedRow(msgspec.Struct, frozen=True, kw_only=True):
-    """A line of the file: a result, and what was flown.
-
-    ``means``: quantity, subject and mean. ``flown``: digest of scenario, options, sources, Python
-    and packages.
-    """
+class _Flown(msgspec.Struct):
+    """The key of a line: a digest of scenario, options, sources, Python and packages."""
 
     flown: str
-    commit: str
-    seed: int
-    outcome: str
-    violations: tuple[Violation, ...]
-    means: tuple[tuple[str, str, float], ...]
-    fingerprint: str
-    sim_time_s: float
-    case: Case
-
-    def result(self) -> SimulationResult:
-        """Return the result of the flight."""
-        return SimulationResult(
-            seed=self.seed,
-            case=self.case,
-            violations=self.violations,
-            outcome=self.outcome,
-            fingerprint=self.fingerprint,
-            means={(_EXPECTATIONS[name], subject): mean for name, subject, mean in self.means},
-            sim_time_s=self.sim_time_s,
-        )
 
 
 class SeedTable:
@@ -70,29 +40,20 @@ class SeedTable:
                 file.truncate(len(content) - len(line))
                 break
             try:
-                row = msgspec.json.decode(line, type=SeedRow)
+                flown = msgspec.json.decode(line, type=_Flown).flown
+                result = msgspec.json.decode(line, type=SimulationResult)
             except msgspec.DecodeError as error:
                 raise ChaserdockError(
                     f"{file.name}: line {number} is no result of a seed ({error}); delete the "
                     "line, or name another file"
                 ) from None
-            if row.flown == self._flown:
-                self.results[row.seed] = row.result()
+            if flown == self._flown:
+                self.results[result.seed] = result
 
     def add(self, result: SimulationResult) -> None:
         """Append a result, in one piece. Raises WriteError."""
         self.results[result.seed] = result
-        row = SeedRow(
-            flown=self._flown,
-            commit=self._commit,
-            seed=result.seed,
-            outcome=result.outcome,
-            violations=result.violations,
-            means=tuple((of.name, subject, m) for (of, subject), m in result.means.items()),
-            fingerprint=result.fingerprint,
-            sim_time_s=result.sim_time_s,
-            case=result.case,
-        )
+        row = {"flown": self._flown, "commit": self._commit} | msgspec.to_builtins(result)
         line = msgspec.json.encode(row) + b"\n"
         with errors_of_writing(self._file.name):
             written = self._file.write(line)

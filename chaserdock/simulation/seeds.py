@@ -10,7 +10,6 @@ import re
 import socket
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 from chaserdock_protocol.errors import ChaserdockError
@@ -18,12 +17,12 @@ from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
-from chaserdock.spread import HERE, Lost, Places, spread
+from chaserdock.spread import HERE, Lost, Places, ServedCall, serve, spread
 from chaserdock.toml_text import toml_document
 
 from .checks.check import Violation
 from .checks.expectations import Expectation
-from .flight import SimulationResult, fly_case
+from .flight import EXPECTATIONS, SimulationResult, fly_case
 from .shrinking import shrink
 from .swarm import Case, draw_case
 
@@ -78,15 +77,27 @@ def flown_digest(options: SeedOptions) -> str:
     return hashlib.sha256(repr(flown).encode()).hexdigest()[:12]
 
 
-def _fly(options: SeedOptions, digest: str, seed: int) -> SimulationResult | UnflownSeed:
-    """Fly a seed, perhaps on another machine. Raises ChaserdockError if it has another scenario."""
-    if flown_digest(options) != digest:
+@dataclass(frozen=True)
+class _Call:
+    """A seed to fly, perhaps on another machine; ``digest``: of what is to fly it."""
+
+    options: SeedOptions
+    digest: str
+    seed: int
+
+
+def _fly(call: _Call) -> SimulationResult | Lost:
+    """Raises ChaserdockError if this machine has another scenario."""
+    if flown_digest(call.options) != call.digest:
         host = socket.gethostname()
-        raise ChaserdockError(f"{options.scenario}: host {host} has another file of that name")
+        raise ChaserdockError(f"{call.options.scenario}: host {host} has another file of that name")
     try:
-        return fly_seed(options, seed)
+        return fly_seed(call.options, call.seed)
     except ScenarioError as error:
-        return UnflownSeed(seed, str(error))
+        return Lost(str(error))
+
+
+_FLY = ServedCall("chaserdock.simulation.seeds", _fly, _Call, SimulationResult)
 
 
 def fly_seeds(
@@ -99,9 +110,10 @@ def fly_seeds(
     """
     name, _ = _load(options)
     options = replace(options, scenario=name)  # a path is absolute: others work elsewhere
-    call = partial(_fly, options, flown_digest(options))
-    for seed, result in spread(call, seeds, places):
-        yield UnflownSeed(seed, result.reason) if isinstance(result, Lost) else result
+    digest = flown_digest(options)
+    calls = (_Call(options, digest, seed) for seed in seeds)
+    for call, result in spread(_FLY, calls, places):
+        yield UnflownSeed(call.seed, result.reason) if isinstance(result, Lost) else result
 
 
 def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[SimulationResult]:
@@ -163,8 +175,8 @@ def means_over(
     """Return the means of flights by quantity and subject, in order."""
     found: dict[tuple[Expectation, str], list[float]] = {}
     for result in results:
-        for key, mean in result.means.items():
-            found.setdefault(key, []).append(mean)
+        for name, subject, mean in result.means:
+            found.setdefault((EXPECTATIONS[name], subject), []).append(mean)
     return dict(sorted(found.items(), key=lambda item: (item[0][0].name, item[0][1])))
 
 
@@ -175,3 +187,7 @@ def inaccuracies(results: Iterable[SimulationResult]) -> list[str]:
         if defect := expected.defect_over(means):
             found.append(f"{expected.invariant}: {subject}: {defect}")
     return found
+
+
+if __name__ == "__main__":
+    serve(_FLY)

@@ -4,16 +4,13 @@
 from __future__ import annotations
 
 import math
-import operator
 import os
 import random
 import signal
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +18,16 @@ import psutil
 import pytest
 import typer
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.shipped_scenarios import find_scenario
-from spread_cases import REAL_SEEDS, die_once, fly
+from seed_cases import REAL_SEEDS
+from seed_cases import TASK as SEEDS
+from spread_cases import TASK, Case
 
 from chaserdock.cli.simulate import simulate
 from chaserdock.simulation import seeds
 from chaserdock.simulation.flight import SimulationResult
 from chaserdock.simulation.seed_table import opened_table
 from chaserdock.simulation.seeds import SeedOptions, fly_seed
-from chaserdock.spread import Lost, Places, spread
+from chaserdock.spread import Lost, Places, ServedCall, spread
 from chaserdock.version import difference, digest_of, version
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -49,37 +47,42 @@ success = {docked = []}
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the processes that a test starts import ``spread_cases``."""
+    """Let the processes that a test starts import ``spread_cases`` and ``seed_cases``."""
     monkeypatch.setenv("PYTHONPATH", str(TESTS))
 
 
 def children() -> list[psutil.Process]:
     """Processes that run calls for this one."""
     found = psutil.Process().children()
-    return [child for child in found if "chaserdock.spread" in " ".join(child.cmdline())]
+    return [child for child in found if TASK.module in child.cmdline()]
 
 
 def test_one_job_calls_in_this_process_and_in_order() -> None:
-    here = spread(lambda item: (item, os.getpid()), range(3))
-    assert list(here) == [(item, (item, os.getpid())) for item in range(3)]
+    here = ServedCall("none", lambda item: (item, os.getpid()), int, tuple)
+    assert list(spread(here, range(3))) == [(item, (item, os.getpid())) for item in range(3)]
 
 
 def test_lost_processes_are_replaced_and_their_calls_repeated(tmp_path: Path) -> None:
-    results = dict(spread(partial(die_once, tmp_path), range(3), Places(2)))
-    assert results == {item: item for item in range(3)}
+    items = [Case("exit once", number, str(tmp_path / str(number))) for number in (1, 4)]
+    assert dict(spread(TASK, items, Places(2))) == {items[0]: 1.0, items[1]: 2.0}
     assert children() == []
 
 
-def test_what_ends_every_process_is_lost_alone() -> None:
-    good, killed = partial(abs, -1), partial(signal.raise_signal, signal.SIGKILL)
-    results = dict(spread(operator.call, [killed, good], Places(2)))
-    reason = "its process ended with status -9 (killed, as when memory is short)"
-    assert results == {good: 1, killed: Lost(reason)}
+def test_what_has_no_result_is_lost_alone(tmp_path: Path) -> None:
+    items = [Case("lose"), Case("root", -1.0), Case("root", 1.0), Case("kill")]
+    results = dict(spread(TASK, items, Places(2)))
+    assert [results[item] for item in items] == [
+        Lost("lost"),
+        Lost("ValueError: math domain error"),
+        1.0,
+        Lost("its process ended with status -9 (killed, as when memory is short)"),
+    ]
 
 
 def test_closing_ends_the_processes_at_once() -> None:
-    with closing(spread(time.sleep, [0.0, 3600.0, 3600.0], Places(2))) as results:
-        assert next(results) == (0.0, None)
+    items = [Case("root"), *[Case("sleep", 3600.0)] * 2]
+    with closing(spread(TASK, items, Places(2))) as results:
+        assert next(results) == (items[0], 0.0)
         assert len(children()) == 2
     assert children() == []
 
@@ -87,19 +90,15 @@ def test_closing_ends_the_processes_at_once() -> None:
 def test_none_begins_after_a_stop() -> None:
     stop = threading.Event()
     flown = []
-    for item, _ in spread(abs, range(100), Places(2), stop.is_set):
+    for item, _ in spread(TASK, [Case("root", k) for k in range(100)], Places(2), stop.is_set):
         flown.append(item)
         stop.set()
     assert 1 <= len(flown) <= 2
 
 
-def test_errors_of_a_call_are_raised_here() -> None:
+def test_error_of_a_call_ends_all() -> None:
     with pytest.raises(ChaserdockError, match=r"^nowhere: no such scenario file or shipped"):
-        list(spread(find_scenario, ["nowhere"], Places(2)))
-    # A mistake of ours costs its call only.
-    assert list(spread(math.sqrt, [-1.0], Places(2))) == [
-        (-1.0, Lost("ValueError: math domain error"))
-    ]
+        list(spread(TASK, [Case("refuse")], Places(2)))
 
 
 def test_versions_differ_by_what_computes() -> None:
@@ -128,7 +127,7 @@ def short(tmp_path: Path) -> Path:
 
 
 def result_of(seed: int) -> SimulationResult:
-    return SimulationResult(seed, {"extends": "single"}, (), "docked", "f", {}, 1.0)
+    return SimulationResult(seed, {"extends": "single"}, (), "docked", "f", (), 1.0)
 
 
 def test_cut_line_is_flown_again_and_other_rows_are_left_alone(short: Path, tmp_path: Path) -> None:
@@ -190,7 +189,7 @@ def test_each_seed_is_once_in_the_table_though_workers_are_killed(
     short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Three kills cannot fail a seed: Dask gives up at the fourth."""
-    monkeypatch.setattr(seeds, "_fly", fly)
+    monkeypatch.setattr(seeds, "_FLY", SEEDS)
     table, drawn, ended = tmp_path / "seeds.jsonl", random.Random(1), threading.Event()
 
     def rows() -> int:
@@ -235,11 +234,12 @@ def test_workers_of_other_sources_are_refused_also_when_they_join_later(
         refused = rf"^--cluster {address}: worker tcp://\S+ has chaserdock \S+ of commit \S+ "
         refused += rf"\(sources 0f0e0d0c\), here .* \(sources {version()['sources'][:8]}\)$"
         monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{TESTS}")
-        results = spread(math.sqrt, map(float, range(10**6)), Places(cluster=address))
+        items = (Case("root", number) for number in range(10**6))
+        results = spread(TASK, items, Places(cluster=address))
         found = dict(next(results) for _ in range(3))
         cluster.scale(2)
         with pytest.raises(ChaserdockError, match=refused):
             found |= results
-        assert all(result == math.sqrt(item) for item, result in found.items())
+        assert all(result == math.sqrt(item.number) for item, result in found.items())
         with pytest.raises(ChaserdockError, match=refused):
-            next(spread(math.sqrt, [1.0], Places(cluster=address)))
+            next(spread(TASK, [Case("root")], Places(cluster=address)))

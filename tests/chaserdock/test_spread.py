@@ -14,10 +14,13 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import psutil
 import pytest
 import typer
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.shipped_scenarios import find_scenario
 from seed_cases import REAL_SEEDS
 from seed_cases import TASK as SEEDS
 from spread_cases import TASK, Case
@@ -27,6 +30,7 @@ from chaserdock.simulation import seeds
 from chaserdock.simulation.flight import SimulationResult
 from chaserdock.simulation.seed_table import opened_table
 from chaserdock.simulation.seeds import SeedOptions, fly_seed
+from chaserdock.simulation.swarm import draw_case
 from chaserdock.spread import Lost, Places, ServedCall, spread
 from chaserdock.version import difference, digest_of, version
 
@@ -128,6 +132,13 @@ def short(tmp_path: Path) -> Path:
 
 def result_of(seed: int) -> SimulationResult:
     return SimulationResult(seed, {"extends": "single"}, (), "docked", "f", (), 1.0)
+
+
+def test_cases_are_equal_after_json() -> None:
+    scenario = load_scenario(find_scenario("fault-drill"))
+    for seed in range(100):
+        case = draw_case("fault-drill", seed, scenario)
+        assert msgspec.json.decode(msgspec.json.encode(case)) == case
 
 
 def test_cut_line_is_flown_again_and_other_rows_are_left_alone(short: Path, tmp_path: Path) -> None:

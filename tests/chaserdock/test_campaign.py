@@ -282,7 +282,7 @@ def test_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.Mon
     campaign = campaign_of(GRID, tmp_path)
     flown: list[str] = []
 
-    def fly(flight: Any, **_: Any) -> FlightOutcome:
+    def fly(flight: Any, *_: Any) -> FlightOutcome:
         flown.append(flight.name)
         return FlightOutcome(flight.name, 0, summary([]), "")
 
@@ -314,7 +314,7 @@ def test_result_of_other_code_is_flown_again_after_what_has_none(
     write_result(tmp_path, FlightOutcome(flights[1].name, 0, summary([]), "", None, None, "new"))
     flown: list[str] = []
 
-    def fly(flight: Any, **_: Any) -> FlightOutcome:
+    def fly(flight: Any, *_: Any) -> FlightOutcome:
         flown.append(flight.name)
         return FlightOutcome(flight.name, 0, summary([]), "", None, None, flight.code)
 

@@ -57,7 +57,7 @@ class BodyRenderer:
         cover = self._cover(eye, attitude, target, obstacles)
         layers = [renderer.render(eye, attitude, *target, obstacles, self._light)
                   for renderer in self._channels]  # fmt: skip
-        space = coloured_space(self._space.draw(attitude, self._light))
+        space = coloured_space(self._space.draw(attitude, self._light).image)
         mixed = cover * np.stack(layers, axis=2) + (1.0 - cover) * space
         return RenderedBodies(shown(space), shown(mixed.astype(np.uint8)), cover[:, :, 0] > 0.0)
 

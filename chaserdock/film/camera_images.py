@@ -85,7 +85,7 @@ class PathTracedCamera:
             traced = cv2.warpAffine(
                 traced, self._to_canvas, self._size, None, flags, cv2.BORDER_REPLICATE
             )
-        behind = self._background.draw(q_w_irf, light)
+        behind = self._background.draw(q_w_irf, light).image
         # Reflectances are equal in all colours: green is grey.
         level = 255.0 * traced[:, :, 1] + (1.0 - np.clip(traced[:, :, 3], 0.0, 1.0)) * behind
         canvas = np.clip(np.rint(level), 0.0, 255.0).astype(np.uint8)

@@ -86,7 +86,7 @@ class PathTracedBodies:
         if key not in self._spaces:
             size = (look.width_px, look.height_px)
             self._spaces[key] = Background(look.pinhole(), np.zeros(2), size, self._earth)
-        return shown(coloured_space(self._spaces[key].draw(look.attitude(), self._light)))
+        return shown(coloured_space(self._spaces[key].draw(look.attitude(), self._light).image))
 
 
 def _plan_of(scenario: Scenario, shots: Sequence[Shot], samples: int) -> str:

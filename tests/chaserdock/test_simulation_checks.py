@@ -1223,9 +1223,9 @@ def test_crashes_stalls_and_early_ends_are_violations(scenario: Scenario) -> Non
 
 def result(**means: float) -> SimulationResult:
     """Return a flight with a mean NEES of a chaser and of the target, and a tracking error."""
-    keys = {"chaser": (NEES, "chaser/1"), "target": (NEES, "target")}
-    keys["tracking"] = (TRACKING, "chaser/1")
-    found = {keys[name]: mean for name, mean in means.items()}
+    keys = {"chaser": (NEES.name, "chaser/1"), "target": (NEES.name, "target")}
+    keys["tracking"] = (TRACKING.name, "chaser/1")
+    found = tuple((*keys[name], mean) for name, mean in means.items())
     return SimulationResult(1, {}, (), "docked", "", found, 25.0)
 
 
@@ -1417,7 +1417,7 @@ def test_shrinking_simplifies_errors_of_clocks() -> None:
 
 
 def a_result(case: Case, *violations: Violation) -> SimulationResult:
-    return SimulationResult(1, case, violations, "", "", {}, 1.0)
+    return SimulationResult(1, case, violations, "", "", (), 1.0)
 
 
 def shrunk(result: SimulationResult) -> Case:

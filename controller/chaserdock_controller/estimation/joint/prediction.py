@@ -151,10 +151,8 @@ def _predict_given_target(
     """
     each = mean[TARGET_MEAN:].reshape(-1, CHASER_MEAN)
     gains, rests = np.empty_like(before.gains), np.empty_like(before.covariances)
-    hub, (given, orbital, fade_view, prior, alive, latched) = (
-        np.zeros((gains.shape[2],) * 2),
-        chasers,
-    )
+    given, orbital, fade_view, prior, alive, latched = chasers
+    hub = np.zeros((gains.shape[2],) * 2)
     for i, own in enumerate(each):
         k, one = slice(i, i + 1), np.concatenate([mean[:TARGET_MEAN], own])
         moved = kernels.predict(

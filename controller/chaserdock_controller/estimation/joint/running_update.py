@@ -97,8 +97,8 @@ class StarUpdate(RunningUpdate):
 
     What an update teaches of the target corrects the other chasers when it is their turn, or at the
     end. Their gains stay those by the target's error at the beginning of the tick, whose
-    corrections add up in ``_learned`` (H,); ``_turn`` (H, H) maps it to the present error, as
-    corrections of the attitude turn its axes.
+    corrections add up in ``_learned`` (H,). ``_turn`` (3, 3) maps that error of the attitude to the
+    present one, as corrections turn its axes; ``_back`` is the inverse.
     """
 
     def _begin(self, mean: Array, covariance: Array) -> None:
@@ -108,7 +108,7 @@ class StarUpdate(RunningUpdate):
         self._gains, self._rests = given.gains.copy(), given.covariances.copy()
         self._target, self._each = mean[:TARGET_MEAN], mean[TARGET_MEAN:].reshape(-1, CHASER_MEAN)
         size = len(self._hub)
-        self._learned, self._turn = np.zeros(size), np.eye(size)
+        self._learned, self._turn, self._back = np.zeros(size), np.eye(3), np.eye(3)
         self._told = np.zeros((len(self._each), size))  # what of it each chaser's mean contains
         self._chaser: int | None = None
         self.innovation = kernels.JointInnovation(1, size + CHASER)
@@ -119,7 +119,7 @@ class StarUpdate(RunningUpdate):
             self._chaser = chaser
             self._tell(np.array([chaser]))
             self.mean = np.concatenate([self._target, self._each[chaser]])
-            gain = self._gains[chaser] @ np.linalg.inv(self._turn)
+            gain = _turned(self._gains[chaser], self._back)
             self.covariance = pair(self._hub, gain, self._rests[chaser])
         return 1, 0
 
@@ -129,9 +129,8 @@ class StarUpdate(RunningUpdate):
         super().correct(z, used, iterations)
         error = self.innovation.correction
         self._learn(error)
-        reset = np.eye(len(self._turn))
-        reset[ATTITUDE, ATTITUDE] = so3.right_jacobian(error[ATTITUDE])
-        self._turn = reset @ self._turn
+        self._turn = so3.right_jacobian(error[ATTITUDE]) @ self._turn
+        self._back = np.linalg.inv(self._turn)
 
     def shift(self, error: Array, covariance: Array) -> None:
         """Correct the pair by its error, and replace its covariance."""
@@ -142,8 +141,9 @@ class StarUpdate(RunningUpdate):
 
     def _learn(self, error: Array) -> None:
         """Add what the error of a pair says of the target to what was learned of it."""
-        hub_error = np.concatenate([error[:TARGET], error[TARGET + CHASER :]])
-        self._learned = self._learned + np.linalg.solve(self._turn, hub_error)
+        added = np.concatenate([error[:TARGET], error[TARGET + CHASER :]])
+        added[ATTITUDE] = self._back @ added[ATTITUDE]
+        self._learned += added
 
     def _tell(self, chasers: NDArray[np.int64]) -> None:
         """Correct the means of ``chasers`` by what their gains say of what was learned."""
@@ -163,16 +163,25 @@ class StarUpdate(RunningUpdate):
         self._chaser = None
         kernels.complete(self.covariance)
         self._hub, gain, self._rests[i] = split(self.covariance)
-        self._gains[i] = gain @ self._turn
+        self._gains[i] = _turned(gain, self._turn)
         self._target, self._each[i] = self.mean[:TARGET_MEAN], self.mean[TARGET_MEAN:]
         self._told[i] = self._learned
 
     def finished(self, updates: int, markers: NDArray[np.int64]) -> JointState:
         self._put_back()
         self._tell(np.arange(len(self._each)))
-        given = ChasersGivenTarget(self._gains @ np.linalg.inv(self._turn), self._rests)
+        given = ChasersGivenTarget(_turned(self._gains, self._back), self._rests)
         mean = np.concatenate([self._target, self._each.reshape(-1)])
         return replace(self._replaced(mean, self._hub, updates, markers), given_target=given)
+
+
+def _turned(gains: Array, turn: Array) -> Array:
+    """Return gains (..., H) by the error of an attitude that ``turn`` (3, 3) maps to the present
+    one.
+    """
+    out = gains.copy()
+    out[..., ATTITUDE] = gains[..., ATTITUDE] @ turn
+    return out
 
 
 def running_update(state: JointState) -> RunningUpdate:

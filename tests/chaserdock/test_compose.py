@@ -172,14 +172,15 @@ def test_image_has_a_key_folder_per_process() -> None:
     could write.
     """
     found = re.search(
-        r"for name in ([a-z \\\n]+) \$\(seq -f chaser-%g 0 15\); do mkdir /keys",
+        r"for name in ([a-z \\\n]+) \$\(seq -f chaser-%g 0 (\d+)\); do mkdir /keys",
         (ROOT / "Dockerfile").read_text(),
     )
     assert found
-    names = set(found[1].replace("\\", " ").split())
-    assert names | {f"chaser-{i}" for i in range(16)} == {
+    names, chasers = set(found[1].replace("\\", " ").split()), int(found[2]) + 1
+    assert chasers == MAX_CHASERS
+    assert names | {f"chaser-{i}" for i in range(chasers)} == {
         "router",
-        *(who.common_name for who in identities(16)),
+        *(who.common_name for who in identities(chasers)),
     }
 
 

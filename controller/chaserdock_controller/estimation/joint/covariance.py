@@ -116,7 +116,9 @@ def with_started_target(s: JointState, chaser: int, by_chaser: Array, own: Array
     hub[:TARGET, :TARGET] = own
     with_shape = -by_chaser @ cross[chaser][:, TARGET:]
     hub[POSE, TARGET:], hub[TARGET:, POSE] = with_shape, with_shape.T
+    with_others = s.given_target.gains @ cross[chaser].T
+    with_others[chaser] = marginal[chaser]
     cross[:, :, :TARGET] = 0.0
-    cross[chaser][:, POSE] = -(by_chaser @ marginal[chaser]).T
+    cross[:, :, POSE] = -with_others @ by_chaser.T
     given = ChasersGivenTarget.of_covariances(hub, cross, marginal)
     return replace(s, covariance=hub, given_target=given)

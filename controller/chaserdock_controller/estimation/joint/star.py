@@ -51,12 +51,14 @@ class ChasersGivenTarget(Struct, frozen=True, eq=False):
         """Return the same for the target's error after a step, while the chasers' own stay.
 
         The step changes its covariance from ``before`` to ``hub`` = F ``before`` F' + ``noise``.
-        The error before it follows from that after it by a gain B but for a rest; the covariance of
-        this is in Joseph's form.
+        The error before it follows from that after it by a gain B but for a rest r, whose
+        covariance is in Joseph's form. Gain by r makes the N chasers dependent: A r, with A the
+        gains of all. As (A r) (A r)' is at most N times its diagonal blocks, chasers with N times
+        the covariance of their part, and independent, have a covariance that is not smaller.
         """
         back = regression(hub, before @ f.T)
         kept = np.eye(len(before)) - back @ f
-        lost = kept @ before @ kept.T + back @ noise @ back.T
+        lost = len(self.gains) * (kept @ before @ kept.T + back @ noise @ back.T)
         rest = self.covariances + self.gains @ lost @ self.gains.transpose(0, 2, 1)
         return ChasersGivenTarget(self.gains @ back, rest)
 

@@ -98,10 +98,10 @@ def predict(
         np.array([i in latched for i in range(n)], dtype=np.int64),
     )
     if state.given_target is not None:
-        covariance, given = _predict_star(state, target_transition, noise, dt, p)
-        given = _predict_given_target(given, motion, chasers, mean)
+        covariance, seen = _predict_star(state, target_transition, noise, dt, p)
+        seen = _predict_given_target(seen, motion, chasers, mean)
         return replace(
-            moved, time_ns=time_ns, covariance=covariance, given_target=given, **mean_fields(mean)
+            moved, time_ns=time_ns, covariance=covariance, given_target=seen, **mean_fields(mean)
         )
     covariance = kernels.predict(
         motion,

@@ -108,7 +108,9 @@ class StarUpdate(RunningUpdate):
         self._gains, self._rests = given.gains.copy(), given.covariances.copy()
         self._target, self._each = mean[:TARGET_MEAN], mean[TARGET_MEAN:].reshape(-1, CHASER_MEAN)
         size = len(self._hub)
-        self._learned, self._turn, self._back = np.zeros(size), np.eye(3), np.eye(3)
+        self._learned = np.zeros(size)
+        self._turn: Array = np.eye(3)
+        self._back: Array = np.eye(3)
         self._told = np.zeros((len(self._each), size))  # what of it each chaser's mean contains
         self._chaser: int | None = None
         self.innovation = kernels.JointInnovation(1, size + CHASER)

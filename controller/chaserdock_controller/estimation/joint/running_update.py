@@ -132,7 +132,7 @@ class StarUpdate(RunningUpdate):
         error = self.innovation.correction
         self._learn(error)
         self._turn = so3.right_jacobian(error[ATTITUDE]) @ self._turn
-        self._back = np.linalg.inv(self._turn)
+        self._back = np.asarray(np.linalg.inv(self._turn), dtype=np.float64)
 
     def shift(self, error: Array, covariance: Array) -> None:
         """Correct the pair by its error, and replace its covariance."""

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from common import Figures, Group, Options, main
-from parts import laboratory
+from parts import cluster, laboratory
 
 from chaserdock.simulation.flight import memory_folder
 from chaserdock.simulation.mission import simulate
@@ -125,6 +125,7 @@ GROUPS = (
         on_request=("instructions",),
     ),
     laboratory.GROUP,
+    cluster.GROUP,
 )
 
 if __name__ == "__main__":

@@ -206,6 +206,30 @@ def simulation() -> None:
     )
 
 
+def spread() -> None:
+    diagram(
+        "spread",
+        {
+            "client": Box(0, 1, "simulate or\ncampaign"),
+            "table": Box(0, 0, "results: a line or\na file each", "file", 0.95),
+            "scheduler": Box(1.6, 1, "Dask scheduler\nof your cluster", "person", 0.9),
+            "worker": Box(3.2, 1.5, "Dask worker\nof your cluster", "person", 0.85),
+            "other": Box(3.2, 0.5, "Dask worker\nof your cluster", "person", 0.85),
+            "flight": Box(4.8, 1.5, "a process per\nthread: a flight", "simulated", 0.9),
+            "refused": Box(4.8, 0.5, "another version:\nrefused", "file", 0.9),
+        },
+        [
+            ("client", "scheduler", "seeds", -0.2),
+            ("scheduler", "client", "results", -0.2),
+            ("client", "table", "as they come"),
+            ("scheduler", "worker", ""),
+            ("scheduler", "other", ""),
+            ("worker", "flight", ""),
+            ("other", "refused", ""),
+        ],
+    )
+
+
 def redundancy() -> None:
     diagram(
         "redundancy",
@@ -923,6 +947,7 @@ def log_info() -> None:
 
 PICTURES: dict[str, Callable[[], None]] = {
     "processes": processes, "simulation": simulation, "redundancy": redundancy,
+    "spread": spread,
     "perception": perception, "errors": errors, "hosts": hosts, "limits": limits,
     "extend": extend, "knowledge": knowledge, "ros2": ros2, "devices": devices, "frames": frames,
     "laboratory": laboratory, "planar": planar,

@@ -330,7 +330,8 @@ def stack(flight: RecordedFlight, _: Traces) -> Figure:
             axes.set_yscale("log")
             _plain_numbers(axes.yaxis)
             unit = label.partition(" / ")[2]
-            limit_line(axes, limit, f"stopped: {limit:g} {unit}; at the end {values[-1]:.2g}")
+            text = f"stopped: {limit:g} {unit}; at the end {values[-1]:.2g}"
+            limit_line(axes, limit, text, at="left")  # where the curve is far above
     panels[0].set_xlim(_span_s(motion.time_s))
     return figure
 

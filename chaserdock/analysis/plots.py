@@ -13,7 +13,7 @@ import io
 import re
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 from chaserdock_protocol.output_files import replaced
@@ -117,16 +117,18 @@ def new_figure(
     return figure, list(axes.ravel())
 
 
-def limit_line(axes: Axes, value: float, label: str) -> None:
-    """Draw a dashed limit across the axes, labelled at its right end."""
+def limit_line(
+    axes: Axes, value: float, label: str, at: Literal["left", "right"] = "right"
+) -> None:
+    """Draw a dashed limit across the axes, labelled at one end."""
     axes.axhline(value, color=LIMIT, linestyle=(0, (5, 3)), linewidth=0.9)
     axes.annotate(
         label,
-        (1.0, value),
+        (1.0 if at == "right" else 0.0, value),
         xycoords=("axes fraction", "data"),
-        xytext=(-2, 2),
+        xytext=(-2 if at == "right" else 2, 2),
         textcoords="offset points",
-        ha="right",
+        ha=at,
         color=LIMIT,
         fontsize=8,
     )

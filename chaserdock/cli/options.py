@@ -113,6 +113,12 @@ StallOpt = Annotated[
         "world after which a process ends",
     ),
 ]
+ClusterOpt = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS", help="fly on the workers of a Dask scheduler, e.g. tcp://host:8786"
+    ),
+]
 ReplyTimeoutOpt = Annotated[
     float, typer.Option(min=0.1, max=3600.0, help="seconds to wait for the reply")
 ]

@@ -19,6 +19,7 @@ from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.stall import DEFAULT_STALL_S
 
 from .options import (
+    ClusterOpt,
     JsonLinesOpt,
     KeysOpt,
     ModeOpt,
@@ -187,9 +188,7 @@ def campaign(
         int | None,
         typer.Option(min=1, help="concurrent runs on this machine; its CPU cores by default"),
     ] = None,
-    cluster: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, e.g. tcp://host:8786")
-    ] = None,
+    cluster: ClusterOpt = None,
     keep_logs: Annotated[
         KeepLogs, typer.Option(help="runs whose logs are kept")
     ] = KeepLogs.failures,
@@ -206,5 +205,7 @@ def campaign(
 
     if only is not None and (cluster is not None or jobs is not None):
         raise fail("--only flies one run on this machine; it excludes --cluster and --jobs")
+    if jobs is not None and cluster is not None:
+        raise fail("--jobs is for this machine; it excludes --cluster")
     workers = Workers(jobs or os.cpu_count() or 1, cluster, keep_logs.value)
     raise typer.Exit(fly_campaign(file, out, workers, only))

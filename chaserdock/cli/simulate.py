@@ -9,6 +9,7 @@ import shlex
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,11 +18,12 @@ import typer
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
 from chaserdock.terminal import labelled, wrapped
 
-from .options import ModeOption, ScenarioArg, fail
+from .options import ClusterOpt, ModeOption, ScenarioArg, fail
 
 if TYPE_CHECKING:
     from chaserdock.simulation.flight import SimulationResult
-    from chaserdock.simulation.seeds import SeedOptions
+    from chaserdock.simulation.seeds import SeedOptions, UnflownSeed
+    from chaserdock.spread import Places
 
 
 def _seed_range(text: str) -> range:
@@ -42,6 +44,14 @@ def simulate(
         ),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, max=256, help="processes to fly seeds on")] = 1,
+    cluster: ClusterOpt = None,
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="append results of seeds as they come; what FILE contains is not flown again",
+        ),
+    ] = None,
     mode: Annotated[
         ModeOption | None, typer.Option(help="fly all seeds in this mode; drawn by default")
     ] = None,
@@ -69,16 +79,15 @@ def simulate(
     """Simulate missions in this process, in virtual time, and check invariants. Status 0 only if
     all of them hold.
     """
-    from chaserdock.simulation.seeds import (
-        SeedOptions,
-        UnflownSeed,
-        fly_seeds,
-    )
+    from chaserdock.simulation.seeds import SeedOptions, UnflownSeed
+    from chaserdock.spread import Places
 
     _check_writable(out)
     if seeds is None:
         given = {
             "--jobs": jobs > 1,
+            "--cluster": cluster is not None,
+            "--results": results is not None,
             "--images": images,
             "--no-shrink": not shrinking,
             "--stop": stop,
@@ -86,35 +95,71 @@ def simulate(
         if unused := [option for option, is_given in given.items() if is_given]:
             raise fail(f"{', '.join(unused)}: only with --seeds")
         raise typer.Exit(_fly_one(scenario, out, mode))
+    if jobs > 1 and cluster is not None:
+        raise fail("--jobs is for this machine; it excludes --cluster")
 
     begin_s = time.monotonic()
-    results: list[SimulationResult] = []
-    outcomes: Counter[str] = Counter()
     options = SeedOptions(scenario, images, None if mode is None else mode.value, to_violation=stop)
+    flown: list[SimulationResult] = []
+    outcomes: Counter[str] = Counter()
     written: list[Path] = []
-    stopped = False
+    chosen, stopped = _seed_range(seeds), False
 
     try:
-        for result in fly_seeds(options, _seed_range(seeds), jobs):
-            if isinstance(result, UnflownSeed):
-                outcomes["not flown"] += 1
-                print(f"seed {result.seed}: not flown: {result.reason}", flush=True)
-                continue
-            results.append(result)
-            outcomes[result.outcome] += 1
-            if not result.violations:
-                continue
-            for violation in result.violations:
-                print(f"seed {result.seed}: {violation}", flush=True)
-            if shrinking:
+        for result in _fly(options, chosen, Places(jobs, cluster), results):
+            flew = not isinstance(result, UnflownSeed)
+            outcomes[result.outcome if flew else "not flown"] += 1
+            _print_seed(result, f"{outcomes.total()}/{len(chosen)}")
+            if flew:
+                flown.append(result)
+                if stop and result.violations:
+                    break
+        # Only now, as processes elsewhere would wait.
+        for result in flown:
+            if shrinking and result.violations:
                 _shrink(result, out, written)
-            if stop:
-                break
     except KeyboardInterrupt:
         stopped = True
+        if results is not None:
+            print("chaserdock: stopped; repeat the command to resume", file=sys.stderr)
 
-    failed = _print_end(options, outcomes, results, written, time.monotonic() - begin_s)
+    failed = _print_end(options, outcomes, flown, written, time.monotonic() - begin_s)
     raise typer.Exit(STOPPED if stopped else FAILED if failed else DONE)
+
+
+def _fly(
+    options: SeedOptions, seeds: range, places: Places, file: Path | None
+) -> Iterator[SimulationResult | UnflownSeed]:
+    """Yield what a file of results has of the seeds, then the others as they end, added to it."""
+    from chaserdock.simulation.seed_table import opened_table
+    from chaserdock.simulation.seeds import UnflownSeed, fly_seeds
+
+    if file is None:
+        yield from fly_seeds(options, seeds, places)
+        return
+    with opened_table(file, options) as table:
+        known = [table.results[seed] for seed in sorted(table.results) if seed in seeds]
+        if known:
+            print(f"{len(known)} of {len(seeds)} seeds are in {file} already", flush=True)
+        yield from known
+        if len(known) == len(seeds):
+            return
+        left = (seed for seed in seeds if seed not in table.results)
+        for result in fly_seeds(options, left, places):
+            if not isinstance(result, UnflownSeed):
+                table.add(result)
+            yield result
+
+
+def _print_seed(result: SimulationResult | UnflownSeed, done: str) -> None:
+    """Print why a seed failed, and on a terminal how many are ``done``."""
+    from chaserdock.simulation.seeds import UnflownSeed
+
+    if sys.stderr.isatty():
+        print(f"\033[K{done}\r", end="", file=sys.stderr, flush=True)
+    unflown = isinstance(result, UnflownSeed)
+    for text in [f"not flown: {result.reason}"] if unflown else result.violations:
+        print(f"seed {result.seed}: {text}", flush=True)
 
 
 def _print_end(

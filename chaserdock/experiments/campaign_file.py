@@ -103,7 +103,7 @@ def load_campaign(path: Path) -> ExperimentPlan:
         raise ScenarioError(f"{path}: not TOML: {error}") from None
     except ValidationError as error:
         raise invalid(error, CampaignFile, path) from None
-    local = path.parent / file.scenario
+    local = path.absolute().parent / file.scenario  # also where workers of a cluster run
     try:
         scenario = local if local.is_file() else find_scenario(file.scenario)
     except ScenarioNotFound as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flies a plan: one process per flight, on this machine or on the workers of a Dask cluster.
+"""Flies a plan: one process per flight, on this machine or on a Dask cluster.
 
 A flight that has ended leaves ``runs/NAME/result.json``, written atomically. Later calls skip it. A
 flight that crashed leaves none and is flown again, and so is, last, one of other code.
@@ -16,19 +16,19 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
-from chaserdock_protocol.errors import require_extra
 from chaserdock_protocol.output_files import write_atomically
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.recording.scan import LOG_NAME
 from msgspec import Struct
 
+from chaserdock.exit_codes import FAILED
+from chaserdock.spread import Lost, Places, ServedCall, serve, spread
 from chaserdock.terminal import wrapped
 from chaserdock.verdict import verdict_of
 
@@ -58,13 +58,9 @@ ReportProgress = Callable[[int, int, PlannedFlight, FlightOutcome], None]
 
 
 @dataclass(frozen=True)
-class Workers:
-    """Where flights are flown: ``jobs`` at a time on this machine, or on the Dask scheduler at
-    ``cluster``. ``keep``: whose logs are kept.
-    """
+class Workers(Places):
+    """Where flights are flown. ``keep``: whose logs are kept."""
 
-    jobs: int = 1
-    cluster: str | None = None
     keep: Keep = "none"
 
 
@@ -78,20 +74,38 @@ def fly_plan(
     """Fly what has no result in ``folder`` yet, then what has one of other code, until ``stop``.
     Returns the outcomes by flight name, in the plan's order.
 
-    Raise ExperimentError, and MissingPackageError for a cluster without Dask.
+    A flight that was lost with its processes is FAILED, without a summary. Raise ChaserdockError.
     """
     folder.mkdir(parents=True, exist_ok=True)
     outcomes = results_of(plan, folder)
     remaining = [f for f in plan.flights if f.name not in outcomes]
     remaining += [f for f in plan.flights if f.name in outcomes and outcomes[f.name].code != f.code]
     left = len(remaining)
-    fly_all = _fly_here if workers.cluster is None else _fly_on_cluster
-    for flight, outcome in fly_all(remaining, folder / "runs", workers, stop):
+    calls = (_Call(flight, workers.keep, str(folder / "runs")) for flight in remaining)
+    for call, flown in spread(_FLY, calls, workers, stop.is_set):
+        flight, outcome = call.flight, flown
+        if isinstance(outcome, Lost):
+            outcome = FlightOutcome(flight.name, FAILED, None, outcome.reason)
         write_result(folder, outcome)
         outcomes[flight.name] = outcome
         left -= 1
         report(len(plan.flights) - left, len(plan.flights), flight, outcome)
     return {f.name: outcomes[f.name] for f in plan.flights if f.name in outcomes}
+
+
+class _Call(Struct, frozen=True):
+    """A flight to fly, perhaps on another machine."""
+
+    flight: PlannedFlight
+    keep: Keep
+    logs: str
+
+
+def _fly(call: _Call) -> FlightOutcome:
+    return fly(call.flight, call.keep, Path(call.logs))
+
+
+_FLY = ServedCall("chaserdock.experiments.worker", _fly, _Call, FlightOutcome)
 
 
 def results_of(plan: ExperimentPlan, folder: Path) -> dict[str, FlightOutcome]:
@@ -132,9 +146,8 @@ def write_result(folder: Path, outcome: FlightOutcome) -> None:
 def fly(flight: PlannedFlight, keep: Keep, logs: Path) -> FlightOutcome:
     """Fly one flight in a temporary folder. Move its log to ``logs`` if ``keep`` asks for it.
 
-    Also runs on Dask workers, therefore arguments and result are plain values. If ``logs`` is not
-    writable (no shared disk), a kept log stays on the worker's machine and the result names host
-    and path.
+    If ``logs`` is not writable (no shared disk), a kept log stays on the worker's machine and the
+    result names host and path.
     """
     folder = Path(tempfile.mkdtemp(prefix=f"chaserdock-{flight.name}-"))
     try:
@@ -182,57 +195,6 @@ def _move_log(log: Path, folder: Path) -> str:
         return f"{socket.gethostname()}:{local}"
 
 
-def _fly_here(
-    flights: Sequence[PlannedFlight], logs: Path, workers: Workers, stop: threading.Event
-) -> Iterator[tuple[PlannedFlight, FlightOutcome]]:
-    """Yield each flight as it ends. Start none after ``stop``."""
-    waiting = iter(flights)
-    with ThreadPoolExecutor(workers.jobs) as pool:
-        active: dict[Any, PlannedFlight] = {}
-        while True:
-            while (
-                len(active) < workers.jobs
-                and not stop.is_set()
-                and (flight := next(waiting, None)) is not None
-            ):
-                active[pool.submit(fly, flight, workers.keep, logs)] = flight
-            if not active:
-                return
-            for future in wait(active, return_when=FIRST_COMPLETED).done:
-                yield active.pop(future), future.result()
-
-
-def _fly_on_cluster(
-    flights: Sequence[PlannedFlight], logs: Path, workers: Workers, stop: threading.Event
-) -> Iterator[tuple[PlannedFlight, FlightOutcome]]:
-    """Yield each flight as it ends. Raise ExperimentError, and MissingPackageError without Dask."""
-    require_extra("distributed", "cluster")
-    from distributed import Client, as_completed
-
-    address = workers.cluster
-    try:
-        client = Client(address, timeout=5)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise ExperimentError(f"--cluster {address}: no Dask scheduler answers: {error}") from None
-    with client:
-        by_key = {}
-        for flight in flights:
-            # pure=False: Dask must not reuse a result. retries=1: the flight of a lost worker is
-            # repeated.
-            future = client.submit(
-                fly, flight, workers.keep, logs, key=flight.name, pure=False, retries=1
-            )
-            by_key[future.key] = (flight, future)
-        for future in as_completed([f for _, f in by_key.values()]):
-            flight = by_key[future.key][0]
-            if future.status == "error":
-                raise ExperimentError(f"{flight.label} failed on the cluster: {future.exception()}")
-            yield flight, future.result()
-            if stop.is_set():
-                client.cancel([f for _, f in by_key.values()])
-                return
-
-
 class ExperimentProgress:
     """Prints one line per flight that has ended: its outcome, and an estimate of the time left."""
 
@@ -254,3 +216,7 @@ class ExperimentProgress:
         varied = ", ".join(f"{name}={value}" for name, value in flight.varied.items())
         label = flight.label + (f" ({varied})" if varied else "")
         print("\n".join(wrapped([f"{ended}/{total} {label}: {verdict}{left}"])), flush=True)
+
+
+if __name__ == "__main__":
+    serve(_FLY)

@@ -7,7 +7,6 @@ import contextlib
 import os
 import tempfile
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,8 +31,8 @@ class SimulationResult:
 
     ``outcome``: the first violated invariant, or else the worst final state of the chasers that are
     to dock. ``fingerprint``: digest of all messages and their times, equal for equal flights.
-    ``means``: mean of each quantity with an expectation over the flight, by quantity and subject;
-    empty unless no sensor lies and the plant is as stated.
+    ``means``: quantity (of ``EXPECTATIONS``), subject, and mean over the flight; empty unless no
+    sensor lies and the plant is as stated.
     """
 
     seed: int
@@ -41,7 +40,7 @@ class SimulationResult:
     violations: tuple[Violation, ...]
     outcome: str
     fingerprint: str
-    means: Mapping[tuple[Expectation, str], float]
+    means: tuple[tuple[str, str, float], ...]
     sim_time_s: float
 
 
@@ -97,19 +96,23 @@ def fingerprint_after(fingerprint: int, sender: str, raw: RawSample) -> int:
     return zlib.crc32(raw.payload, head)
 
 
-def _means(checks: FlightChecks) -> dict[tuple[Expectation, str], float]:
+EXPECTATIONS: dict[str, Expectation] = {of.name: of for of in (NEES, TRACKING)}
+"""Quantities of which flights have means, by name."""
+
+
+def _means(checks: FlightChecks) -> tuple[tuple[str, str, float], ...]:
     """Return the means of the quantities with an expectation in a flight that should meet it."""
     if not checks.view.causes.honest:
-        return {}
+        return ()
     estimates, tracking = checks.find(CovarianceConsistency), checks.find(TrackingAccuracy)
     found = {(NEES, "target"): estimates.nees}
     found |= {(NEES, f"chaser/{i}"): values for i, values in estimates.relative_nees.items()}
     found |= {(TRACKING, f"chaser/{i}"): values for i, values in tracking.values.items()}
-    return {
-        key: sum(values) / len(values)
-        for key, values in found.items()
+    return tuple(
+        (of.name, subject, sum(values) / len(values))
+        for (of, subject), values in found.items()
         if len(values) >= LEAST_SAMPLES
-    }
+    )
 
 
 def memory_folder() -> str | None:

@@ -1,42 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flies many seeds, optionally on several processes. Shrinks cases that fail, and checks
-consistency over all seeds.
+"""Flies many seeds, optionally on several processes or machines. Shrinks cases that fail, and
+checks consistency over all seeds.
 """
 
 from __future__ import annotations
 
-import contextlib
-import itertools
-import multiprocessing.connection
-import os
+import hashlib
 import re
-import signal
-import sys
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from multiprocessing.connection import Connection
+import socket
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.output_files import write_atomically
-from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
-from chaserdock.exit_codes import STOPPED
+from chaserdock.spread import HERE, Lost, Places, ServedCall, serve, spread
 from chaserdock.toml_text import toml_document
 
 from .checks.check import Violation
 from .checks.expectations import Expectation
-from .flight import SimulationResult, fly_case
+from .flight import EXPECTATIONS, SimulationResult, fly_case
 from .shrinking import shrink
 from .swarm import Case, draw_case
 
 _NOT_DOCKED = "ends in phase "
 """Start of the text about a chaser that should have docked or be safe."""
-_END_S = 5.0
-"""Wall time, s, in which a process ends its flight and removes its folder."""
 
 
 @dataclass(frozen=True)
@@ -79,120 +70,50 @@ def fly_seed(options: SeedOptions, seed: int) -> SimulationResult:
     return fly_case(case, seed, to_violation=options.to_violation)
 
 
-def _fly(options: SeedOptions, seed: int) -> SimulationResult | UnflownSeed:
+def flown_digest(options: SeedOptions) -> str:
+    """Return a digest of what flies the seeds: scenario and options. Raises ScenarioError."""
+    name, scenario = _load(options)
+    flown = (name, scenario.model_dump_json(), options.images, options.mode, options.to_violation)
+    return hashlib.sha256(repr(flown).encode()).hexdigest()[:12]
+
+
+@dataclass(frozen=True)
+class _Call:
+    """A seed to fly, perhaps on another machine; ``digest``: of what is to fly it."""
+
+    options: SeedOptions
+    digest: str
+    seed: int
+
+
+def _fly(call: _Call) -> SimulationResult | Lost:
+    """Raises ChaserdockError if this machine has another scenario."""
+    if flown_digest(call.options) != call.digest:
+        host = socket.gethostname()
+        raise ChaserdockError(f"{call.options.scenario}: host {host} has another file of that name")
     try:
-        return fly_seed(options, seed)
+        return fly_seed(call.options, call.seed)
     except ScenarioError as error:
-        return UnflownSeed(seed, str(error))
+        return Lost(str(error))
+
+
+_FLY = ServedCall("chaserdock.simulation.seeds", _fly, _Call, SimulationResult)
 
 
 def fly_seeds(
-    options: SeedOptions, seeds: Iterable[int], jobs: int = 1
+    options: SeedOptions, seeds: Iterable[int], places: Places = HERE
 ) -> Iterator[SimulationResult | UnflownSeed]:
-    """Yield the results of the seeds in order. Raises ScenarioError at once if none can be flown.
+    """Yield the results of the seeds as they end, which is in order with one job. Raises
+    ChaserdockError at once if none can be flown.
 
-    The processes (``jobs``) end at once when the generator does.
+    Processes of this machine end at once when the generator does.
     """
-    _load(options)
-    if jobs == 1:
-        yield from (_fly(options, seed) for seed in seeds)
-        return
-    os.environ.update(
-        SINGLE_THREADED
-    )  # read by the numerical libraries of the new processes when they start
-    workers: list[_Worker] = []
-    try:
-        for _ in range(jobs):
-            workers.append(_Worker(options))
-        yield from _fly_on(workers, iter(seeds))
-    finally:
-        for worker in workers:
-            worker.end()
-
-
-class _Worker:
-    """A process that flies one seed after the other. ``turn``: position of its ``seed`` in the
-    order of all.
-    """
-
-    def __init__(self, options: SeedOptions) -> None:
-        self.options, self.seed, self.turn = options, 0, 0
-        self._start()
-
-    def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
-        self._process = context.Process(target=_work, args=(self.options, theirs), daemon=True)
-        self._process.start()
-        theirs.close()
-
-    def answer(self) -> SimulationResult | UnflownSeed | ChaserdockError:
-        """Return what the process has sent. If it has died, start another one."""
-        try:
-            return self.connection.recv()
-        except (EOFError, OSError):
-            self._process.join(1.0)
-            self.end()
-            status = self._process.exitcode
-            self._start()
-            why = " (killed, as when memory is short)" if status == -signal.SIGKILL else ""
-            return UnflownSeed(self.seed, f"its process ended with status {status}{why}")
-
-    def end(self) -> None:
-        """End the process; kill it if it does not end."""
-        self._process.terminate()
-        self._process.join(_END_S)
-        self._process.kill()
-        self._process.join()
-        self.connection.close()
-
-
-def _work(options: SeedOptions, connection: Connection) -> None:
-    """Fly the seeds that arrive until the connection closes. Sends back results, or errors that
-    concern all seeds.
-    """
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches all processes; the parent ends this one
-    # As an exception: the flight's folder in memory is removed.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(STOPPED))
-    with contextlib.suppress(EOFError):
-        while True:
-            seed = connection.recv()
-            try:
-                connection.send(_fly(options, seed))
-            except ChaserdockError as error:
-                connection.send(error)
-
-
-def _fly_on(
-    workers: Sequence[_Worker], seeds: Iterator[int]
-) -> Iterator[SimulationResult | UnflownSeed]:
-    """Yield the results of the seeds in order; a free worker flies the next seed."""
-    flying: dict[Connection, _Worker] = {}
-    flown: dict[int, SimulationResult | UnflownSeed] = {}
-    turns, turn = itertools.count(), 0
-
-    def assign(worker: _Worker) -> None:
-        for seed in itertools.islice(seeds, 1):
-            worker.seed, worker.turn = seed, next(turns)
-            with contextlib.suppress(OSError):  # of a process that has died, which its answer shows
-                worker.connection.send(seed)
-            flying[worker.connection] = worker
-
-    for worker in workers:
-        assign(worker)
-    while flying:
-        for connection in multiprocessing.connection.wait(list(flying)):
-            worker = flying.pop(cast(Connection, connection))
-            answer = worker.answer()
-            if isinstance(answer, ChaserdockError):
-                raise answer
-            flown[worker.turn] = answer
-            assign(worker)
-        while turn in flown:
-            yield flown.pop(turn)
-            turn += 1
+    name, _ = _load(options)
+    options = replace(options, scenario=name)  # a path is absolute: others work elsewhere
+    digest = flown_digest(options)
+    calls = (_Call(options, digest, seed) for seed in seeds)
+    for call, result in spread(_FLY, calls, places):
+        yield UnflownSeed(call.seed, result.reason) if isinstance(result, Lost) else result
 
 
 def shrink_result(result: SimulationResult, attempts: int = 200) -> Iterator[SimulationResult]:
@@ -254,8 +175,8 @@ def means_over(
     """Return the means of flights by quantity and subject, in order."""
     found: dict[tuple[Expectation, str], list[float]] = {}
     for result in results:
-        for key, mean in result.means.items():
-            found.setdefault(key, []).append(mean)
+        for name, subject, mean in result.means:
+            found.setdefault((EXPECTATIONS[name], subject), []).append(mean)
     return dict(sorted(found.items(), key=lambda item: (item[0][0].name, item[0][1])))
 
 
@@ -266,3 +187,7 @@ def inaccuracies(results: Iterable[SimulationResult]) -> list[str]:
         if defect := expected.defect_over(means):
             found.append(f"{expected.invariant}: {subject}: {defect}")
     return found
+
+
+if __name__ == "__main__":
+    serve(_FLY)

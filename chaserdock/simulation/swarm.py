@@ -43,7 +43,7 @@ disturbance plus the time of an approach.
 """
 
 Case = dict[str, Any]
-"""Keys and values of a scenario file."""
+"""Keys and values of a scenario file, as JSON has them: lists, no tuples."""
 
 
 def draw_fault(
@@ -315,7 +315,7 @@ def _draw_commands(draw: random.Random, scenario: Scenario) -> list[dict[str, An
     """Return a timeline: the scenario's, with random operator commands; may be empty."""
     if draw.random() > 0.3:
         return []
-    timeline = [e.model_dump(exclude_none=True) for e in scenario.timeline]
+    timeline = [e.model_dump(mode="json", exclude_none=True) for e in scenario.timeline]
     for _ in range(draw.choice([1, 2, 3])):
         chaser = draw.randrange(len(scenario.chasers))
         command = draw.choice(["hold", "retreat", "abort", "approach", "goto"])

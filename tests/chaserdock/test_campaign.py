@@ -6,7 +6,6 @@ from __future__ import annotations
 import html
 import json
 import math
-import os
 import re
 import signal
 import subprocess
@@ -295,7 +294,7 @@ def test_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.Mon
     outcomes = fly_plan(
         campaign,
         tmp_path,
-        Workers(2),
+        Workers(),
         lambda ended, total, flight, outcome: progress.append(ended),
         threading.Event(),
     )
@@ -453,7 +452,6 @@ def test_table_is_equal_after_kill_and_resume_and_on_a_cluster(tmp_path: Path) -
 
     from distributed import LocalCluster
 
-    os.environ.setdefault("DASK_DISTRIBUTED__WORKER__DAEMON", "False")
     cluster: Any = LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=""
     )

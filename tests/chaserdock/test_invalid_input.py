@@ -63,6 +63,8 @@ INVALID = [
         "from the edge of the cone the target is 40 degrees off the view of chaser 0, whose camera "
         "sees 18 degrees",
     ),
+    ("simulate single --seeds=1:3 --jobs 2 --cluster tcp://a:1", "it excludes --cluster"),
+    ("simulate single --cluster tcp://a:1", "--cluster: only with --seeds"),
     ("simulate single --seeds=5:3", "must be FIRST:LAST or one number, below 2^32"),
     ("simulate single --seeds=x", "must be FIRST:LAST or one number, below 2^32"),
     ("simulate single --seeds=-1", "must be FIRST:LAST or one number, below 2^32"),
@@ -175,6 +177,7 @@ INVALID = [
     ("compare {golden} {golden} --tolerance -1", "--tolerance"),
     ("campaign nowhere.toml", "nowhere.toml"),
     ("campaign nowhere.toml --jobs 0", "--jobs"),
+    ("campaign nowhere.toml --jobs 2 --cluster tcp://a:1", "it excludes --cluster"),
     ("campaign nowhere.toml --only 0 --jobs 2", "--only flies one run"),
     ("check controller nowhere -- true", "nowhere"),
     ("check controller {golden} --timeout nan -- true", "--timeout"),

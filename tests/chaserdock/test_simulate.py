@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import time
@@ -26,9 +26,7 @@ from chaserdock.simulation.checks.reader import reads
 from chaserdock.simulation.flight import fly_case
 from chaserdock.simulation.seeds import (
     SeedOptions,
-    UnflownSeed,
     fly_seed,
-    fly_seeds,
     shrink_result,
     write_case,
 )
@@ -72,6 +70,20 @@ def test_seeds_of_a_good_mission_pass_on_two_processes(good: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
+def test_results_of_a_file_are_not_flown_again_but_count(bad: Path, tmp_path: Path) -> None:
+    seed = next(s for s in range(1, 50) if fly_seed(SeedOptions(str(bad)), s).violations)
+    table = tmp_path / "seeds.jsonl"
+    arguments = ("simulate", str(bad), "--no-shrink", "--results", str(table), "--seeds")
+    first = finished(*arguments, str(seed))
+    rows = table.read_bytes()
+    again = finished(*arguments, str(seed))
+    assert (first[0], again[0], table.read_bytes()) == (1, 1, rows)
+    notice, _, rest = again[1].partition("\n")
+    assert notice == f"1 of 1 seeds are in {table} already"
+    assert re.sub(r"in \d+ s", "", rest) == re.sub(r"in \d+ s", "", first[1])
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [(), ("--seeds", "1:2")], ids=["one", "seeds"])
 @pytest.mark.parametrize("out", ["good.toml", "good.toml/below"])
 def test_out_must_be_a_folder_that_can_be_written(
@@ -92,10 +104,12 @@ def test_out_must_be_writable(good: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.slow
 def test_options_of_seeds_need_seeds(good: Path) -> None:
-    options = ("--jobs", "2", "--images", "--stop", "--no-shrink")
+    options = ("--jobs", "2", "--results", "r", "--images", "--stop", "--no-shrink")
     status, text = finished("simulate", str(good), *options)
     assert status == 2
-    assert text == "chaserdock: --jobs, --images, --no-shrink, --stop: only with --seeds\n"
+    assert (
+        text == "chaserdock: --jobs, --results, --images, --no-shrink, --stop: only with --seeds\n"
+    )
 
 
 @pytest.mark.slow
@@ -223,18 +237,6 @@ def test_cases_of_two_scenarios_have_files_of_their_own(
     paths = [write_case(result, tmp_path / "out") for result in results]
     assert [path.name for path in paths] == ["good-seed-2.toml", "bad-seed-2.toml"]
     assert [load_scenario(path).success.docked for path in paths] == [(), (0,)]
-
-
-@pytest.mark.slow
-def test_a_killed_process_costs_one_seed(good: Path) -> None:
-    flights = fly_seeds(SeedOptions(str(good)), range(1, 7), jobs=2)
-    results = [next(flights)]
-    os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
-    results += flights
-    assert [result.seed for result in results] == [1, 2, 3, 4, 5, 6]
-    (lost,) = (result for result in results if isinstance(result, UnflownSeed))
-    assert lost.reason == "its process ended with status -9 (killed, as when memory is short)"
-    assert multiprocessing.active_children() == []
 
 
 @pytest.mark.slow

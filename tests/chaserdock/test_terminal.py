@@ -82,7 +82,7 @@ def results(*violated: int) -> Iterator[SimulationResult | UnflownSeed]:
     for seed in range(1, 5):
         violations = (Violation("liveness", 1.0, "chaser/0: hangs"),) if seed in violated else ()
         outcome = "liveness" if violations else "docked"
-        yield SimulationResult(seed, {"extends": "single"}, violations, outcome, "f", {}, 1.0)
+        yield SimulationResult(seed, {"extends": "single"}, violations, outcome, "f", (), 1.0)
 
 
 @pytest.mark.parametrize(

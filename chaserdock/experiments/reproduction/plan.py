@@ -5,9 +5,7 @@ trends, missions of several chasers.
 
 from __future__ import annotations
 
-import hashlib
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +16,11 @@ from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock.experiments.plan import (
     ONE_PROCESS,
     Alone,
-    ExperimentError,
     ExperimentPlan,
     PlannedFlight,
     plan_flight,
 )
+from chaserdock.version import sources_digest
 
 from .paper import BASELINE, PAPER_S, ROWS, PaperRow
 
@@ -136,36 +134,12 @@ DELAYS_S: dict[str, tuple[float, ...]] = {
 """Command delays with which the rows that have failed runs are flown."""
 
 
-_PACKAGES = (
-    "chaserdock",
-    "chaserdock_agents",
-    "chaserdock_controller",
-    "chaserdock_models",
-    "chaserdock_protocol",
-    "chaserdock_world",
-)
-
-
 @cache
 def code_digest() -> str:
     """Return a digest of the flying code and its scenarios, so that flights of another version are
-    flown again. Raise ExperimentError unless all packages are installed.
+    flown again. Raise ChaserdockError unless all packages are installed.
     """
-    digest = hashlib.sha256()
-    own = Path(__file__).resolve().parent
-    for package in _PACKAGES:
-        spec = find_spec(package)
-        if spec is None or spec.origin is None:
-            raise ExperimentError(
-                f"{package} is not installed; a reproduction needs all packages on this machine"
-            )
-        folder = Path(spec.origin).resolve().parent
-        for path in sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".c", ".h")):
-            if path.parent != own:
-                digest.update(path.read_bytes())
-    for path in sorted(find_scenario(SCENARIO).parent.glob("*.toml")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
+    return sources_digest(without=Path(__file__).resolve().parent)
 
 
 def flight_of(

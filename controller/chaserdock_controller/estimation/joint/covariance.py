@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariance of the joint filter in either of two forms. Pure functions; no other module but
-``star_update`` depends on the form.
+"""Covariance of the joint filter in either of two forms. Pure functions; besides it only
+``prediction``, ``running_update``, ``floor`` and ``state`` depend on the form.
 
 Dense: ``JointState.covariance`` is that of the whole error vector, (D, D). A tick costs O(N^3).
 
@@ -8,9 +8,8 @@ Star: the chasers are independent of each other given the target. ``JointState.c
 of the target (and its shape), (H, H), and ``JointState.given_target`` holds for each chaser the
 regression of its error on the target's, and the covariance of the rest. A tick costs O(N).
 Measurements concern one chaser and the target, and preserve this structure. Process noise of the
-target does not: after it, what two chasers knew of the former target makes them dependent.
-``predicted`` keeps the covariance of the target with each chaser, and drops what is then left
-between two chasers (docs/estimation.md).
+target does not: ``ChasersGivenTarget.after`` bounds what it leaves between two chasers, so that the
+star is never more certain than all correlations allow (docs/estimation.md).
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ ENV PYTHONUNBUFFERED=1 HOME=/tmp \
 RUN useradd --uid 10001 --no-create-home --home-dir /tmp chaserdock \
     && mkdir -p /keys /runs /scenarios \
     && for name in router world controller standby recorder operator analysis viewer bridge \
-         $(seq -f chaser-%g 0 15); do mkdir /keys/$name; done \
+         $(seq -f chaser-%g 0 63); do mkdir /keys/$name; done \
     && chmod -R 1777 /keys
 COPY requirements.txt docker/mujoco-requirements.txt docker/slim.py /opt/chaserdock/
 RUN pip install --no-cache-dir --require-hashes -r /opt/chaserdock/requirements.txt \

@@ -7,12 +7,13 @@ nothing else beside it.
 """
 
 from common import main
-from parts import against, endurance, long_logs, mission_speed, scale
+from parts import against, endurance, long_logs, mission_speed, scale, swarm
 
 GROUPS = (
     mission_speed.GROUP,
     against.GROUP,
     scale.GROUP,
+    swarm.GROUP,
     long_logs.GROUP,
     endurance.GROUP,
 )

@@ -54,7 +54,9 @@ def deploy(
         _make_keys(keys, chasers or 16, host or [], days, shared, renew)
         return
     refuse_options(context, ("host", "days", "shared", "renew"), "only with --keys")
-    from chaserdock.launch.compose_file import MAX_CHASERS, compose_file
+    from chaserdock_protocol.scenario.fields import MAX_CHASERS
+
+    from chaserdock.launch.compose_file import compose_file
 
     number = chasers or 4
     if number > MAX_CHASERS:

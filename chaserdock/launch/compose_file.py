@@ -5,10 +5,9 @@ only.
 
 from __future__ import annotations
 
+from chaserdock_protocol.scenario.fields import MAX_CHASERS
 from chaserdock_protocol.transport.access_control import identities
 
-MAX_CHASERS = 16
-"""Largest number of chasers: the image has key folders for so many."""
 _SHIPPED = {1: "single", 2: "two-chaser-tracking", 4: "four-chaser-docking", 16: "sixteen-chasers"}
 """Scenario that a file flies unless SCENARIO is set, by number of chasers."""
 
@@ -182,7 +181,8 @@ def compose_file(chasers: int, *, standby: bool = False, view: bool = False) -> 
     """Return compose.yaml for up to ``chasers`` chasers, optionally with a standby controller and
     the viewer (profile ``view``).
 
-    Raises ValueError for a number of chasers outside 1 to ``MAX_CHASERS``.
+    Raises ValueError for a number of chasers outside 1 to ``MAX_CHASERS``: the image has key
+    folders for so many.
     """
     if not 1 <= chasers <= MAX_CHASERS:
         raise ValueError(f"{chasers} chasers: must be from 1 to {MAX_CHASERS}")

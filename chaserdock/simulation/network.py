@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import random
 import re
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -46,14 +46,22 @@ def matches(expression: str, key: str) -> bool:
     """Return whether a key expression includes a key. ``*`` stands for one chunk, ``**`` for any
     number of chunks.
     """
+    return expression == key or _pattern(expression).fullmatch(key) is not None
+
+
+@lru_cache(maxsize=4096)
+def _pattern(expression: str) -> re.Pattern[str]:
     pattern = re.escape(expression).replace(r"\*\*/", "(.*/)?").replace(r"\*\*", ".*")
-    return re.fullmatch(pattern.replace(r"\*", "[^/]*"), key) is not None
+    return re.compile(pattern.replace(r"\*", "[^/]*"))
 
 
 @dataclass
 class _Subscription:
-    """A subscription. ``links``: from the publishers that know of it, by name."""
+    """The subscription ``number`` of a network. ``links``: from the publishers that know of it, by
+    name.
+    """
 
+    number: int
     owner: SimulatedConnection
     expression: str
     arrived: Callable[[RawSample], None]
@@ -84,7 +92,10 @@ class SimulatedNetwork:
         self._connections: dict[str, SimulatedConnection] = {}
         self._opened: Counter[str] = Counter()
         self._subscriptions: list[_Subscription] = []
+        self._subscribed = 0
         self._routes: dict[str, list[_Subscription]] = {}
+        self._of_keys: dict[str, list[_Subscription]] = {}
+        self._of_patterns: list[_Subscription] = []
 
     def open(self, name: str) -> tuple[Connection, Host]:
         """Connect a process. One that is started again replaces its earlier connection."""
@@ -128,8 +139,20 @@ class SimulatedNetwork:
 
     def _route(self, key: str) -> list[_Subscription]:
         if key not in self._routes:
-            self._routes[key] = [s for s in self._subscriptions if matches(s.expression, key)]
+            if not self._routes:
+                self._sort_subscriptions()
+            found = list(self._of_keys.get(key, ()))
+            found += [s for s in self._of_patterns if matches(s.expression, key)]
+            self._routes[key] = sorted(found, key=lambda s: s.number)
         return self._routes[key]
+
+    def _sort_subscriptions(self) -> None:
+        """Separate the subscriptions of one key each, which most are, from those of patterns."""
+        self._of_keys, self._of_patterns = defaultdict[str, list[_Subscription]](list), []
+        for subscription in self._subscriptions:
+            is_pattern = "*" in subscription.expression
+            of = self._of_patterns if is_pattern else self._of_keys[subscription.expression]
+            of.append(subscription)
 
     def _arrive(self, link: MessageLink, to: _Subscription, raw: RawSample) -> None:
         """Hand a sample that has crossed a link to its subscriber."""
@@ -207,7 +230,8 @@ class SimulatedNetwork:
         self, owner: SimulatedConnection, expression: str, arrived: Callable[[RawSample], None]
     ) -> None:
         """Add a subscription. Each publisher learns of it when the declaration arrives there."""
-        added = _Subscription(owner, expression, arrived)
+        added = _Subscription(self._subscribed, owner, expression, arrived)
+        self._subscribed += 1
         for name in self._connections:
             if name != owner.name:
                 self._declare(added, name)

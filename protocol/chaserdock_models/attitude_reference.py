@@ -31,15 +31,18 @@ def facing_attitudes(
     if up is not None:
         offsets, nominal = flattened(offsets, up), flattened(nominal, up)
     a = nominal / np.linalg.norm(nominal)
-    length = np.linalg.norm(offsets, axis=1, keepdims=True)
+    length = np.sqrt(np.add.reduce(offsets * offsets, axis=1, keepdims=True))
     b = np.where(length > 1e-9, offsets / np.maximum(length, 1e-9), a)
-    turn = np.concatenate(
-        [1.0 + (b @ a)[:, None], np.cross(np.broadcast_to(a, b.shape), b)], axis=1
-    )
+    turn = np.empty((len(b), 4))
+    turn[:, 0] = 1.0 + b @ a
+    for k in range(3):  # a x b, without the checks of np.cross
+        i, j = (k + 1) % 3, (k + 2) % 3
+        turn[:, k + 1] = a[i] * b[:, j] - a[j] * b[:, i]
+    turned = np.sqrt(np.add.reduce(turn * turn, axis=1, keepdims=True))
+    if turned.min() >= 1e-6:
+        return multiply(normalize(turn), np.asarray(q_nominal_wxyz, dtype=float))
     axis = np.eye(3)[2 if abs(a[2]) < 0.9 else 0] if up is None else up
     axis = axis - (axis @ a) * a
     half_turn = np.concatenate([[0.0], axis / np.linalg.norm(axis)])
-    opposite = np.linalg.norm(turn, axis=1, keepdims=True) < 1e-6
-    return multiply(
-        normalize(np.where(opposite, half_turn, turn)), np.asarray(q_nominal_wxyz, dtype=float)
-    )
+    turn = np.where(turned < 1e-6, half_turn, turn)
+    return multiply(normalize(turn), np.asarray(q_nominal_wxyz, dtype=float))

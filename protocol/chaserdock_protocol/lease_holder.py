@@ -10,6 +10,7 @@ majority of the others need not share a chaser with one that included it.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -81,13 +82,20 @@ class LeaseHolder:
 
     def missing(self, tick: Tick) -> list[int]:
         """Return the chasers whose lease of a tick has neither arrived nor is lost."""
+        return list(self._missing(tick))
+
+    def is_complete(self, tick: Tick) -> bool:
+        """Test whether no lease of a tick is missing."""
+        return next(self._missing(tick), None) is None
+
+    def _missing(self, tick: Tick) -> Iterator[int]:
         leases, lost, newest = self.leases, self._lost, (tick.tick, tick.revision)
-        return [
+        return (
             i
             for i in tick.chasers
             if ((lease := leases.get(i)) is None or (lease.tick, lease.revision) < newest)
             and lost.get(i, -1) < tick.tick
-        ]
+        )
 
     def _granted(self, name: str, tick: Tick) -> list[Lease]:
         """Return the leases of a tick that a controller holds."""

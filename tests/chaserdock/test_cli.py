@@ -182,7 +182,7 @@ def test_completion() -> None:
         "scenarios/single.toml",
     ]
     assert completed("chaserdock", "command", "ab") == ["abort"]
-    assert completed("chaserdock", "scenario", "swa") == ["swap"]
+    assert completed("chaserdock", "scenario", "swa") == ["swap", "swarm-64"]
 
 
 def lines_of(out: str) -> list[JsonLine]:

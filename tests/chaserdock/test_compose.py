@@ -13,6 +13,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from chaserdock_protocol.scenario.fields import MAX_CHASERS
 from chaserdock_protocol.transport.access_control import identities
 from compose_project import Project, compose_command, docker
 from harness import ROOT, SHORT
@@ -120,7 +121,7 @@ def test_file_in_the_repository_is_the_output_for_four_chasers() -> None:
     )
 
 
-@pytest.mark.parametrize("chasers", range(1, 17))
+@pytest.mark.parametrize("chasers", [*range(1, 17), MAX_CHASERS])
 @pytest.mark.parametrize("more", [False, True])
 def test_generated_file_has_the_services_and_volumes_of_the_mission(
     chasers: int, more: bool
@@ -142,9 +143,9 @@ def test_generated_file_has_the_services_and_volumes_of_the_mission(
     assert f"--chasers {chasers}" in project["services"]["router"]["command"][0]
 
 
-@pytest.mark.parametrize("chasers", [0, 17])
+@pytest.mark.parametrize("chasers", [0, MAX_CHASERS + 1])
 def test_number_of_chasers_is_limited_by_the_image(chasers: int) -> None:
-    with pytest.raises(ValueError, match="must be from 1 to 16"):
+    with pytest.raises(ValueError, match=f"must be from 1 to {MAX_CHASERS}"):
         compose_file(chasers)
 
 
@@ -171,14 +172,15 @@ def test_image_has_a_key_folder_per_process() -> None:
     could write.
     """
     found = re.search(
-        r"for name in ([a-z \\\n]+) \$\(seq -f chaser-%g 0 15\); do mkdir /keys",
+        r"for name in ([a-z \\\n]+) \$\(seq -f chaser-%g 0 (\d+)\); do mkdir /keys",
         (ROOT / "Dockerfile").read_text(),
     )
     assert found
-    names = set(found[1].replace("\\", " ").split())
-    assert names | {f"chaser-{i}" for i in range(16)} == {
+    names, chasers = set(found[1].replace("\\", " ").split()), int(found[2]) + 1
+    assert chasers == MAX_CHASERS
+    assert names | {f"chaser-{i}" for i in range(chasers)} == {
         "router",
-        *(who.common_name for who in identities(16)),
+        *(who.common_name for who in identities(chasers)),
     }
 
 

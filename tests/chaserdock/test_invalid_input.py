@@ -203,7 +203,7 @@ INVALID = [
     ("calibrate nowhere --out a.txt", "must end in .yaml, .json or .xml"),
     ("calibrate nowhere --out a.yaml --square nan", "--square"),
     ("calibrate nowhere --out a.yaml --square -0.03", "--square"),
-    ("deploy --chasers 17", "--chasers 17: at most 16 without --keys"),
+    ("deploy --chasers 65", "--chasers 65: at most 64 without --keys"),
     ("deploy --days 3", "--days: only with --keys"),
     ("deploy --keys {tmp} --view", "--view: not with --keys"),
     ("deploy --keys {tmp} --chasers 0", "--chasers"),

@@ -248,8 +248,10 @@ class Recorder:
         return awaited | {solver} if self._latest.get(solver, -1) < self._commanded else awaited
 
     def _acknowledge(self) -> None:
-        held = min(self._latest.get(key, -1) for key in self._awaited())
-        if held > self._acked:
+        awaited, latest = self._awaited(), self._latest
+        # Most messages leave others to wait for: find one of these before looking at all.
+        if all(latest.get(key, -1) > self._acked for key in awaited):
+            held = min(latest[key] for key in awaited)
             self._acked = held
             self.node.publish(topics.ACK, RecorderAck(tick=held))
             if held % _HEALTH_TICKS == 0:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -100,6 +99,23 @@ class NoContact(Check):
                 self.violate(f"{a} and {b}", "bodies touch")
 
 
+def pairs_nearer_than(
+    distance_m: float, places: Sequence[Sequence[float]]
+) -> list[tuple[int, int]]:
+    """Return the pairs (i, j), i < j, of places (3,) that are nearer to each other, in order.
+
+    Only places that are neighbours along the first axis are compared.
+    """
+    found, order = [], sorted(range(len(places)), key=lambda i: places[i][0])
+    for k, i in enumerate(order):
+        for j in order[k + 1 :]:
+            if places[j][0] - places[i][0] >= distance_m:
+                break
+            if math.dist(places[i], places[j]) < distance_m:
+                found.append((min(i, j), max(i, j)))
+    return sorted(found)
+
+
 @dataclass
 class KeepOutZone(Check):
     """Distances between chasers and from the target stay above those of `[limits]` less
@@ -134,9 +150,10 @@ class KeepOutZone(Check):
         }
 
         limit_m = self.scenario.limits.min_distance_chasers_m - KEEP_OUT_SLACK_M
-        for (a, at), (b, bt) in itertools.combinations(chasers.items(), 2):
-            if (distance_m := math.dist(at, bt)) < limit_m:
-                self.violate(f"{a} and {b}", f"{distance_m:.3f} m apart")
+        names, places = list(chasers), list(chasers.values())
+        for a, b in pairs_nearer_than(limit_m, places):
+            distance_m = math.dist(places[a], places[b])
+            self.violate(f"{names[a]} and {names[b]}", f"{distance_m:.3f} m apart")
 
         if target is None or view.causes.misleads(view.time_s):
             return

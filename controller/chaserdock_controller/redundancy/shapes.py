@@ -29,6 +29,7 @@ from chaserdock_controller.estimation.identification.faults import DetectorState
 from chaserdock_controller.estimation.joint.hypotheses import FilterState
 from chaserdock_controller.estimation.joint.parameters import TargetParameters
 from chaserdock_controller.estimation.joint.replay import FilterTick
+from chaserdock_controller.estimation.joint.star import ChasersGivenTarget
 from chaserdock_controller.estimation.joint.state import (
     CHANNELS,
     CHASER,
@@ -136,6 +137,10 @@ ARRAYS: dict[type, dict[str, tuple[ArrayShape, ...]]] = {
         "view_units_ns": (_EACH,),
         "ratio_information": ((5, 5),),
     },
+    ChasersGivenTarget: {
+        "gains": (("chasers", CHASER, "errors"),),
+        "covariances": (("chasers", CHASER, CHASER),),
+    },
     SightedTarget: {"position_m": (_3,), "q_wxyz": (_4,)},
 }
 """Shapes of the arrays in each field. Those of a field with several arrays repeat in order."""
@@ -218,7 +223,8 @@ def _sizes_of(value: Any, chasers: int) -> dict[str, int]:
     """Return the sizes that an object determines itself."""
     match value:
         case JointState():
-            return {"errors": TARGET + CHASER * chasers + SHAPE * (value.shape is not None)}
+            dense = CHASER * chasers if value.given_target is None else 0
+            return {"errors": TARGET + dense + SHAPE * (value.shape is not None)}
         case PlanSearch():
             return {"stack": len(value.problem.limits_N)}
     return {}

@@ -76,7 +76,7 @@ class HotStandby:
         newest = self.newest
         if self.realtime or self.replaying or newest is None or newest.tick > tick.tick:
             return True
-        return not self.leases.missing(newest)
+        return self.leases.is_complete(newest)
 
     def decide(self, processed: Tick | None = None) -> bool:
         """Determine who commands the newest tick. Returns whether this process starts to command

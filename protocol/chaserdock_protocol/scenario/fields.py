@@ -19,6 +19,11 @@ from pydantic import (
     model_validator,
 )
 
+MAX_CHASERS = 64
+"""Largest number of chasers of a scenario: the largest whose costs and flights are measured
+(docs/evidence/scale.md).
+"""
+
 LARGEST = 1e12
 """Bound on the magnitude of every number, so that squares and products of values stay finite."""
 

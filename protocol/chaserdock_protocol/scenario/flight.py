@@ -23,7 +23,7 @@ from .checks import check_flight
 from .detumble import Detumble
 from .docking import Docking
 from .errors import invalid
-from .fields import Name, Section
+from .fields import MAX_CHASERS, Name, Section
 from .inspection import Inspection
 from .migrations import FORMAT
 from .navigation import NavigationSection
@@ -83,7 +83,7 @@ class FlightScenario(Section):
     inspection: Inspection = Inspection()
     docking: Docking = Docking()
     detumble: Detumble = Detumble()
-    chasers: tuple[FlightChaser, ...] = Field(min_length=1, max_length=16)
+    chasers: tuple[FlightChaser, ...] = Field(min_length=1, max_length=MAX_CHASERS)
     timeline: tuple[TimelineEntry, ...] = ()
 
     @model_validator(mode="after")

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, model_validator
 
-from .fields import Index, NotNegative, Oriented, Positive, Section, UnitQuaternion, Vector
+from .fields import (
+    MAX_CHASERS,
+    Index,
+    NotNegative,
+    Oriented,
+    Positive,
+    Section,
+    UnitQuaternion,
+    Vector,
+)
 
 if TYPE_CHECKING:
     from . import Scenario
@@ -164,13 +173,13 @@ class LabSection(Section):
     """Devices of a laboratory, and what must never happen in it."""
 
     safety: LabSafety
-    camera: tuple[LabCamera, ...] = Field(default=(), max_length=16)
-    odometry: tuple[LabPose, ...] = Field(min_length=1, max_length=16)
-    robot: tuple[LabRobot, ...] = Field(min_length=1, max_length=16)
-    latch: tuple[LabLatch, ...] = Field(default=(), max_length=16)
+    camera: tuple[LabCamera, ...] = Field(default=(), max_length=MAX_CHASERS)
+    odometry: tuple[LabPose, ...] = Field(min_length=1, max_length=MAX_CHASERS)
+    robot: tuple[LabRobot, ...] = Field(min_length=1, max_length=MAX_CHASERS)
+    latch: tuple[LabLatch, ...] = Field(default=(), max_length=MAX_CHASERS)
     reference: tuple[LabPose, ...] = Field(
         default=(),
-        max_length=17,
+        max_length=MAX_CHASERS + 1,
         description="Poses by motion capture that flight software does not receive: results are "
         "evaluated against them.",
     )

@@ -14,7 +14,7 @@ from .camera import CameraSection
 from .checks import check_consistent
 from .detumble import RestLimits
 from .faults import Fault
-from .fields import Index, NotNegative, Positive, Section, Vector
+from .fields import MAX_CHASERS, Index, NotNegative, Positive, Section, Vector
 from .flight import FlightScenario
 from .lab import LabSection, check_lab
 from .rendezvous import Arrival, ConeLimit, SpeedLimit
@@ -128,7 +128,7 @@ class Scenario(FlightScenario):
     target: Target = Target()  # pyright: ignore[reportIncompatibleVariableOverride]
     camera: CameraSection = CameraSection()  # pyright: ignore[reportIncompatibleVariableOverride]
     chasers: tuple[Chaser, ...] = Field(  # pyright: ignore[reportIncompatibleVariableOverride]
-        min_length=1, max_length=16
+        min_length=1, max_length=MAX_CHASERS
     )
     thruster_failure: tuple[ThrusterFailure, ...] = ()
     fault: tuple[Fault, ...] = Field(default=(), max_length=100)

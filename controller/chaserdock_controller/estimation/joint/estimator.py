@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import lru_cache
 
 import msgspec
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
-from chaserdock_models.arrays import Array, IntArray
+from chaserdock_models.arrays import Array
 from chaserdock_models.passive_safety import DisturbedMotion
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Innovation, Odometry, Sighting
@@ -36,6 +35,7 @@ from chaserdock_controller.estimation.types import (
 from chaserdock_controller.interfaces import RelativePose, TargetState
 
 from .between_ticks import split_tick
+from .covariance import between, of_chaser, within
 from .hypotheses import FilterState, mixture_covariance, target_state
 from .measurements import mounting_of
 from .parameters import JointParameters, TargetParameters, rows_of
@@ -43,7 +43,6 @@ from .prediction import disturbance, predict_target
 from .replay import FilterTick, ReplayBuffer
 from .state import (
     ATTITUDE,
-    CHASER,
     FOCAL,
     FORCE,
     POSE,
@@ -53,13 +52,14 @@ from .state import (
     VELOCITY,
     VIEW,
     JointState,
-    block,
     with_body,
 )
 from .tick import is_target_lost, process_tick
 
 _IDENTITY_3 = np.eye(3)
 _NO_DISTURBANCE = np.zeros(6)
+_POSES = np.concatenate([POSE, TARGET + POSE])
+"""Components of a pair that hold the poses of target and chaser."""
 
 
 class JointEstimator(Estimator):
@@ -236,10 +236,10 @@ class JointEstimator(Estimator):
         s, p = self.state, self.parameters
         if s is None or not s.target_known or not s.alive[chaser]:
             return None
-        own = np.r_[: VELOCITY.stop, ATTITUDE, FORCE] + block(chaser).start
+        own = np.r_[: VELOCITY.stop, ATTITUDE, FORCE] + TARGET
         known = np.concatenate([np.arange(VELOCITY.stop), own])
         # Of the target's position and velocity, then the chaser's, its attitude, its force.
-        covariance = s.covariance[np.ix_(known, known)]
+        covariance = between(s, chaser, known, known)
         prior_N2 = p.disturbance_force_N**2
         lasting_N2 = min(p.lasting_force_N**2, prior_N2)
         stated = lasting_N2 * prior_N2 * np.eye(3)
@@ -261,9 +261,9 @@ class JointEstimator(Estimator):
         if s is None or not s.target_known or self.parameters.camera_turn_rad == 0.0:
             return {}
         for i in np.flatnonzero(s.alive).tolist():
-            part = slice(block(i).start + TURN.start, block(i).start + FOCAL.stop)
-            e = s.of(i, slice(TURN.start, FOCAL.stop))
-            errors[i] = CameraError(e[:3], e[3:6], float(e[6]), s.covariance[part, part])
+            part = slice(TURN.start, FOCAL.stop)
+            e = s.of(i, part)
+            errors[i] = CameraError(e[:3], e[3:6], float(e[6]), of_chaser(s, i)[part, part])
         return errors
 
     def _with(self, target: TargetParameters) -> JointParameters:
@@ -327,23 +327,12 @@ class JointEstimator(Estimator):
         )
 
 
-@lru_cache(maxsize=64)
-def _pose_rows(chasers: tuple[int, ...]) -> IntArray:
-    """Return the rows (n, 12) of a covariance that hold the poses of the target and of each
-    chaser.
-    """
-    ids = np.array(chasers, dtype=np.int64)
-    poses = np.broadcast_to(POSE, (len(ids), 6))
-    return np.concatenate([poses, TARGET + CHASER * ids[:, None] + POSE], axis=1)
-
-
 def relative_poses(s: JointState, chasers: Sequence[int]) -> list[RelativePose]:
     """Return the poses of chasers in TRF with their covariances (6, 6): position in TRF, rotation
     in CRF.
     """
-    rows = _pose_rows(tuple(chasers))
     places, j = _relative_jacobians(s, chasers)
-    covariances = j @ s.covariance[rows[:, :, None], rows[:, None, :]] @ j.transpose(0, 2, 1)
+    covariances = j @ within(s, chasers, _POSES) @ j.transpose(0, 2, 1)
     return [
         RelativePose(place, so3.inverse_multiply(s.q_wxyz, s.attitudes_wxyz[i]), covariance)
         for i, place, covariance in zip(chasers, places, covariances, strict=True)
@@ -356,12 +345,11 @@ def random_covariance(s: JointState, chaser: int) -> Array:
 
     Between two times in one view these errors cancel. Axes as in ``RelativePose``.
     """
-    rows, start = _pose_rows((chaser,))[0], block(chaser).start
-    kept = start + np.arange(TURN.start, VIEW.stop)
+    kept = TARGET + np.arange(TURN.start, VIEW.stop)
     j = _relative_jacobians(s, (chaser,))[1][0]
-    p, shared = s.covariance, j @ s.covariance[rows[:, None], kept]
-    own = np.linalg.pinv(p[kept[:, None], kept], rcond=1e-12, hermitian=True)
-    return j @ p[rows[:, None], rows] @ j.T - shared @ own @ shared.T
+    shared = j @ between(s, chaser, _POSES, kept)
+    own = np.linalg.pinv(between(s, chaser, kept, kept), rcond=1e-12, hermitian=True)
+    return j @ between(s, chaser, _POSES, _POSES) @ j.T - shared @ own @ shared.T
 
 
 def _relative_jacobians(s: JointState, chasers: Sequence[int]) -> tuple[list[Array], Array]:

@@ -11,7 +11,7 @@ and -v_z = dv_z. These rows have independent errors and are used one after the o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
@@ -19,8 +19,10 @@ from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.plane import UP, across
 from msgspec.structs import replace
 
+from .kernels import TARGET_MEAN
 from .parameters import LevelFloor
-from .state import ATTITUDE, RATE, VELOCITY, JointState, block, inject
+from .running_update import StarUpdate
+from .state import ATTITUDE, RATE, TARGET, VELOCITY, JointState, block, inject
 
 _GATE_SIGMAS = 5.0
 """Residual, in sigmas, that counts at most against a hypothesis: more would come from errors of the
@@ -32,17 +34,41 @@ FloorRow = tuple[IntArray, Array, float, float]
 
 def keep_on_floor(state: JointState, floor: LevelFloor) -> JointState:
     """Return the state updated by the knowledge that its bodies are on a floor."""
-    covariance, error = state.covariance.copy(), np.zeros(len(state.covariance))
-    likelihood = state.log_likelihood
-    for components, derivatives, residual, variance in rows_of_bodies(state, floor):
+    if state.given_target is not None:
+        return _keep_star_on_floor(state, floor)
+    rows, likelihood = rows_of_bodies(state, floor), state.log_likelihood
+    covariance, error, likelihood = _observed(state.covariance, rows, likelihood)
+    return inject(replace(state, covariance=covariance, log_likelihood=likelihood), error)
+
+
+def _keep_star_on_floor(state: JointState, floor: LevelFloor) -> JointState:
+    """Do the same in star form, pair by pair."""
+    update, likelihood = StarUpdate(state), state.log_likelihood
+    bodies = [0] * state.target_known + [TARGET] * int(state.alive.sum())
+    chasers = [0] * state.target_known + np.flatnonzero(state.alive).tolist()
+    for first, chaser in zip(bodies, chasers, strict=True):
+        update.place(chaser)
+        body = update.mean[TARGET_MEAN if first else 0 :]
+        up = UP if first else np.array(floor.up_trf)
+        rows = _of_body(first, body[6:10], body[3:6], body[10:13], up, floor)
+        covariance, error, likelihood = _observed(update.covariance, rows, likelihood)
+        update.shift(error, covariance)
+    return replace(update.finished(state.updates, state.markers), log_likelihood=likelihood)
+
+
+def _observed(
+    before: Array, rows: Iterable[FloorRow], likelihood: float
+) -> tuple[Array, Array, float]:
+    """Return covariance, error and log likelihood after measured rows."""
+    covariance, error = before.copy(), np.zeros(len(before))
+    for components, derivatives, residual, variance in rows:
         column = covariance[:, components] @ derivatives
         spread = float(derivatives @ column[components]) + variance
         off = residual - float(derivatives @ error[components])
         error += column * (off / spread)
         covariance -= np.outer(column, column / spread)
         likelihood -= 0.5 * (min(off * off / spread, _GATE_SIGMAS**2) + math.log(spread))
-    covariance = 0.5 * (covariance + covariance.T)
-    return inject(replace(state, covariance=covariance, log_likelihood=likelihood), error)
+    return 0.5 * (covariance + covariance.T), error, likelihood
 
 
 def rows_of_bodies(state: JointState, floor: LevelFloor) -> Iterator[FloorRow]:

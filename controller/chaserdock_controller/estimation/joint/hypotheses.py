@@ -20,6 +20,7 @@ from msgspec.structs import replace
 from chaserdock_controller.estimation.types import EstimatorEvent, Shock
 from chaserdock_controller.interfaces import TargetState
 
+from .covariance import with_target_noise
 from .parameters import TargetParameters
 from .state import RATES, JointState
 
@@ -74,19 +75,10 @@ def rates_of(h: JointState) -> TargetRates:
     return TargetRates(h.velocity_m_s, h.omega_rad_s, h.covariance[np.ix_(RATES, RATES)])
 
 
-def widened(covariance: Array, variances: Array, first: int = 0) -> Array:
-    """Return the covariance with ``variances`` (6,) added to the rates of the body whose error
-    begins at ``first``.
-    """
-    wider, k = covariance.copy(), first + RATES
-    wider[k, k] += variances
-    return wider
-
-
 def with_uncertain_rates(h: JointState, p: TargetParameters) -> JointState:
     """Return the hypothesis with its rates widened by the variances of a reinitialization."""
     added = rate_variances(p.reinitialised_velocity_m_s, p.reinitialised_omega_rad_s)
-    return replace(h, covariance=widened(h.covariance, added))
+    return with_target_noise(h, RATES, added)
 
 
 def apply_shocks(state: FilterState, shocks: Sequence[Shock]) -> FilterState:
@@ -97,10 +89,9 @@ def apply_shocks(state: FilterState, shocks: Sequence[Shock]) -> FilterState:
         added = rate_variances(shock.sigma_velocity_m_s, shock.sigma_omega_rad_s)
         hypotheses = tuple(
             replace(
-                h,
+                with_target_noise(h, RATES, added),
                 velocity_m_s=h.velocity_m_s + shock.velocity_m_s,
                 omega_rad_s=h.omega_rad_s + shock.omega_rad_s,
-                covariance=widened(h.covariance, added),
             )
             for h in state.hypotheses
         )

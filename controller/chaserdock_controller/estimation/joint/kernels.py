@@ -24,10 +24,12 @@ from .native import LIBRARY, function
 
 # Numbers of doubles in the kernels' arrays: see native/layout.h.
 TARGET_MEAN, CHASER_MEAN = 13, 44
+TARGET, CHASER = 12, 43
+"""Components of the target's error, and of a chaser's."""
 MOST_ROWS = 18
 """Largest number of rows that a chaser measures in a tick: 6 of a sighting, 12 of odometry."""
 # Components of the error that a chaser's measurements depend on (see native/layout.h).
-_SEEN = 55
+_SEEN = TARGET + CHASER
 # Number of gated channels (`state.CHANNELS`).
 _CHANNELS = 5
 
@@ -175,7 +177,7 @@ class JointInnovation:
 
 def _error_size(n: int) -> int:
     """Return the number of error components of a target without shape and ``n`` chasers."""
-    return 12 + 43 * n
+    return TARGET + CHASER * n
 
 
 def check_size(mean: Array, covariance: Array) -> int:

@@ -264,6 +264,10 @@ class JointParameters:
     """Mean motion of the target's orbit; 0 in free space. Chasers move by Clohessy-Wiltshire. The
     target stays at the origin of the Hill frame, where these forces vanish.
     """
+    most_dense_chasers: int = 16
+    """Largest number of chasers with a covariance of all errors (``covariance``): up to it a tick
+    fits its period, and the flights that the accuracy was measured in have no more.
+    """
     floor: LevelFloor | None = None
     """Floor on which all bodies are; None in space."""
     camera_turn_rad: float = field(init=False)

@@ -18,12 +18,14 @@ import math
 from collections.abc import Sequence, Set
 from ctypes import c_double
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_wrench
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from chaserdock_controller.bodies.body_shape import RATIOS, SHAPE
 from chaserdock_controller.interfaces import AppliedImpulse
@@ -32,6 +34,7 @@ from . import kernels
 from .kernels import CHASER_MEAN, TARGET_MEAN
 from .motion_models import free_shape, process_noise, steady_motion
 from .parameters import JointParameters
+from .star import ChasersGivenTarget, assembled, taken_apart
 from .state import (
     ATTITUDE_DRIFT,
     CENTRE,
@@ -82,16 +85,29 @@ def predict(
     if p.mean_motion_rad_s:
         for i, row in enumerate(mean[TARGET_MEAN:].reshape(n, CHASER_MEAN)[:, :13]):
             orbital[i] = cw_wrench(p.mean_motion_rad_s, row, p.body.mass_kg, p.inertia)
-    covariance = kernels.predict(
-        _motion(dt, p, unknown_s),
-        np.ascontiguousarray(target_transition[:, :TARGET]),
-        _target_noise(dt, p, bool(latched)) if state.target_known else np.zeros((TARGET, TARGET)),
+    noise = np.zeros((TARGET, TARGET))
+    if state.target_known:
+        noise = _target_noise(dt, p, bool(latched))
+    motion = _motion(dt, p, unknown_s)
+    chasers = (
         applied,
         orbital,
         np.array([math.exp(-dt / p.sighting_noise(k).view_time_s) for k in state.markers.tolist()]),
         chaser_prior(p),
         state.alive.astype(np.int64),
         np.array([i in latched for i in range(n)], dtype=np.int64),
+    )
+    if state.given_target is not None:
+        covariance, seen = _predict_star(state, target_transition, noise, dt, p)
+        seen = _predict_given_target(seen, motion, chasers, mean)
+        return replace(
+            moved, time_ns=time_ns, covariance=covariance, given_target=seen, **mean_fields(mean)
+        )
+    covariance = kernels.predict(
+        motion,
+        np.ascontiguousarray(target_transition[:, :TARGET]),
+        noise,
+        *chasers,
         mean,
         state.covariance,
     )
@@ -100,6 +116,52 @@ def predict(
         ratios = covariance[-SHAPE:, -SHAPE:][RATIOS, RATIOS]
         _fade_ratios(ratios, state.ratio_information, dt, state, p)
     return replace(moved, time_ns=time_ns, covariance=covariance, **mean_fields(mean))
+
+
+def _predict_star(
+    state: JointState, transition: Array, noise: Array, dt: float, p: JointParameters
+) -> tuple[Array, ChasersGivenTarget]:
+    """Return the target's covariance (H, H) after ``dt``, and the present errors of the chasers by
+    the target's error then.
+    """
+    assert state.given_target is not None
+    f, added = np.eye(len(state.covariance)), np.zeros_like(state.covariance)
+    f[:TARGET], added[:TARGET, :TARGET] = transition, noise
+    covariance = f @ state.covariance @ f.T
+    if state.ratio_information is not None:
+        ratios = covariance[-SHAPE:, -SHAPE:][RATIOS, RATIOS]
+        before = ratios.copy()
+        _fade_ratios(ratios, state.ratio_information, dt, state, p)
+        added[-SHAPE:, -SHAPE:][RATIOS, RATIOS] = ratios - before
+    covariance[:TARGET, :TARGET] += noise
+    covariance = 0.5 * (covariance + covariance.T)
+    return covariance, state.given_target.after(state.covariance, f, added, covariance)
+
+
+def _predict_given_target(
+    before: ChasersGivenTarget,
+    motion: kernels.MotionParameters,
+    chasers: tuple[NDArray[Any], ...],
+    mean: Array,
+) -> ChasersGivenTarget:
+    """Return the errors of the chasers by the target's after their own motion, and predict their
+    ``mean`` in place. ``chasers``: arguments of ``kernels.predict`` by chaser.
+
+    The kernel transforms gains as it does covariances with a target that rests.
+    """
+    each = mean[TARGET_MEAN:].reshape(-1, CHASER_MEAN)
+    gains, rests = np.empty_like(before.gains), np.empty_like(before.covariances)
+    given, orbital, fade_view, prior, alive, latched = chasers
+    hub = np.zeros((gains.shape[2],) * 2)
+    for i, own in enumerate(each):
+        k, one = slice(i, i + 1), np.concatenate([mean[:TARGET_MEAN], own])
+        moved = kernels.predict(
+            motion, np.eye(TARGET), np.zeros((TARGET, TARGET)), given[k], orbital[k], fade_view[k],
+            prior, alive[k], latched[k], one, assembled(hub, *before.of(i)),
+        )  # fmt: skip
+        own[:] = one[TARGET_MEAN:]
+        _, gains[i], rests[i] = taken_apart(moved)
+    return ChasersGivenTarget(gains, rests)
 
 
 def _motion(dt: float, p: JointParameters, unknown_s: float) -> kernels.MotionParameters:

@@ -24,14 +24,13 @@ from chaserdock_controller.bodies.body_shape import (
 )
 
 from . import kernels
-from .kernels import CHASER_MEAN, TARGET_MEAN
+from .kernels import CHASER, CHASER_MEAN, TARGET, TARGET_MEAN
 from .parameters import BodyPrior, TargetParameters
+from .star import ChasersGivenTarget
 
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
 POSE, RATES = np.array([0, 1, 2, 6, 7, 8]), np.array([3, 4, 5, 9, 10, 11])
 """Components of a body's error that belong to its pose and to its rates."""
-TARGET = 12
-"""Components of the target's error."""
 FORCE, TORQUE = slice(12, 15), slice(15, 18)
 """Disturbance on the chaser, body axes, N and N m."""
 CENTRE = slice(18, 21)
@@ -46,8 +45,6 @@ the focal length.
 """
 VIEW = slice(37, 43)
 """Error of its sightings that persists with the view, in units of the stated sigmas."""
-CHASER = 43
-"""Components of a chaser's error."""
 EXTRA = CHASER - 12
 """Number of a chaser's additive states: components of its error that are added without a
 rotation.
@@ -83,7 +80,9 @@ class JointState(Struct, frozen=True, eq=False, kw_only=True):
     view_units_ns (N,): time of the newest sighting in that mean.
     nis (N, 4): moving averages of the normalized innovation squared of odometry's channels.
 
-    covariance: (12 + CHASER N, 12 + CHASER N), or ``SHAPE`` more with a ``shape``.
+    covariance: (12 + CHASER N, 12 + CHASER N), or ``SHAPE`` more with a ``shape``. With
+        ``given_target`` only (12, 12), or ``SHAPE`` more.
+    given_target: the chasers' part of the covariance in star form (see ``covariance``).
     """
 
     time_ns: int
@@ -112,6 +111,7 @@ class JointState(Struct, frozen=True, eq=False, kw_only=True):
     ratio_information: Array | None = None
     shape_ns: int = 0
     log_likelihood: float = 0.0
+    given_target: ChasersGivenTarget | None = None
 
     @property
     def chasers(self) -> int:
@@ -123,9 +123,11 @@ class JointState(Struct, frozen=True, eq=False, kw_only=True):
         return self.extra[chaser, part.start - 12 : part.stop - 12]
 
 
-def empty_state(time_ns: int, chasers: int) -> JointState:
-    """Return a state in which nothing is known."""
+def empty_state(time_ns: int, chasers: int, *, star: bool = False) -> JointState:
+    """Return a state in which nothing is known. ``star``: with the covariance in star form."""
     n = chasers
+    size = TARGET if star else TARGET + CHASER * n
+    given = ChasersGivenTarget(np.zeros((n, CHASER, TARGET)), np.zeros((n, CHASER, CHASER)))
     return JointState(
         time_ns=time_ns,
         position_m=np.zeros(3),
@@ -137,7 +139,7 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
         attitudes_wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
         omegas_rad_s=np.zeros((n, 3)),
         extra=np.zeros((n, EXTRA)),
-        covariance=np.zeros((TARGET + CHASER * n, TARGET + CHASER * n)),
+        covariance=np.zeros((size, size)),
         alive=np.zeros(n, dtype=bool),
         odometry_ns=np.zeros(n, dtype=np.int64),
         measured_ns=np.zeros(n, dtype=np.int64),
@@ -146,6 +148,7 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
         markers=np.ones(n, dtype=np.int64),
         view_units=np.zeros((n, 6, 6)),
         view_units_ns=np.zeros(n, dtype=np.int64),
+        given_target=given if star else None,
     )
 
 
@@ -161,11 +164,16 @@ def with_body(state: JointState, p: TargetParameters) -> JointState:
 def start_shape(state: JointState, p: TargetParameters) -> JointState:
     """Return the state with the shape of the target restarted from the knowledge in ``p``."""
     inertia = np.array(p.inertia_ratios, dtype=float)
-    own = TARGET + CHASER * state.chasers
+    given = state.given_target
+    own = TARGET if given is not None else TARGET + CHASER * state.chasers
     covariance = np.zeros((own + SHAPE, own + SHAPE))
     covariance[:own, :own] = state.covariance[:own, :own]
     if p.body_covariance:
         covariance[own:, own:] = shape_covariance(inertia, np.array(p.body_covariance))
+    if given is not None:
+        cross, marginal = given.covariances_by(state.covariance)
+        cross = np.pad(cross[:, :, :TARGET], ((0, 0), (0, 0), (0, SHAPE)))
+        given = ChasersGivenTarget.of_covariances(covariance, cross, marginal)
     return replace(
         state,
         shape=shape_of(inertia, np.array(p.centre_of_mass_trf_m)),
@@ -175,6 +183,7 @@ def start_shape(state: JointState, p: TargetParameters) -> JointState:
         ),
         shape_ns=state.time_ns,
         covariance=covariance,
+        given_target=given,
     )
 
 

@@ -17,6 +17,7 @@ from threadpoolctl import ThreadpoolController
 
 from chaserdock_controller.estimation.types import EstimatorEvent
 
+from .covariance import with_chaser_noise
 from .floor import keep_on_floor
 from .hypotheses import (
     FilterState,
@@ -28,7 +29,6 @@ from .hypotheses import (
     rate_variances,
     rates_of,
     unknown_rates,
-    widened,
     with_uncertain_rates,
 )
 from .measurements import CameraMounting
@@ -37,9 +37,9 @@ from .prediction import predict
 from .replay import FilterTick
 from .state import (
     CHANNELS,
+    RATES,
     SIGHTING_CHANNEL,
     JointState,
-    block,
     empty_state,
     start_shape,
     with_body,
@@ -100,7 +100,7 @@ def process_tick(
     events: list[EstimatorEvent] = []
     old = before
     if old is None:
-        old = FilterState(record.time_ns, (empty_state(record.time_ns, chasers),))
+        old = FilterState(record.time_ns, (_unknown(record.time_ns, chasers, p),))
     _report_restarts(old.hypotheses[0], record, p, events)
     hypotheses = [_propagate(h, record, p) for h in old.hypotheses]
     seen = {i: s for i, s in record.sightings.items() if s.solutions and hypotheses[0].alive[i]}
@@ -124,6 +124,11 @@ def process_tick(
     return choose(now, p.target, events), tuple(events)
 
 
+def _unknown(time_ns: int, chasers: int, p: JointParameters) -> JointState:
+    """Return a state in which nothing is known."""
+    return empty_state(time_ns, chasers, star=chasers > p.most_dense_chasers)
+
+
 def _propagate(state: JointState, record: FilterTick, p: JointParameters) -> JointState:
     """Predict a hypothesis to the time of a tick. Start chasers that are unknown, and restart those
     that no measurement has supported for long.
@@ -141,27 +146,23 @@ def _propagate(state: JointState, record: FilterTick, p: JointParameters) -> Joi
             state = start_chaser(state, i, odometry, p)
         newest[i] = record.time_ns
     variances = rate_variances(p.contact_velocity_m_s, p.contact_omega_rad_s)
-    covariance = state.covariance
     for c in record.chasers:
         if c.contact:
-            covariance = widened(covariance, variances, block(c.chaser).start)
+            state = with_chaser_noise(state, c.chaser, RATES, variances)
         if c.last_command is not None and state.alive[c.chaser] and not c.latched:
-            covariance = _with_unknown_command(
-                covariance, c.chaser, c.last_command, record.covered_s, p
-            )
-    state = replace(state, covariance=covariance)
+            state = _with_unknown_command(state, c.chaser, c.last_command, record.covered_s, p)
     return replace(state, odometry_ns=newest)
 
 
 def _with_unknown_command(
-    covariance: Array, i: int, wrench: Array, period_s: float, p: JointParameters
-) -> Array:
-    """Return the covariance with a chaser's rates widened for an unknown command: as large as
+    state: JointState, i: int, wrench: Array, period_s: float, p: JointParameters
+) -> JointState:
+    """Return the state with a chaser's rates widened for an unknown command: as large as
     ``wrench`` (6,), for one period.
     """
     velocity = float(np.linalg.norm(wrench[:3])) * period_s / p.body.mass_kg
     rate = float(np.linalg.norm(wrench[3:])) * period_s / min(p.inertia)
-    return widened(covariance, rate_variances(velocity, rate), block(i).start)
+    return with_chaser_noise(state, i, RATES, rate_variances(velocity, rate))
 
 
 def _stale_ns(record: FilterTick, p: JointParameters) -> int:

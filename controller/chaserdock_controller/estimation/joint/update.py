@@ -33,9 +33,8 @@ from chaserdock_protocol.messages import Innovation, Odometry, PoseSolution, Sig
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from chaserdock_controller.bodies.body_shape import SHAPE
-
 from . import kernels
+from .covariance import of_chaser, with_started_chaser, with_started_target
 from .hypotheses import TargetRates
 from .measurements import (
     CameraMounting,
@@ -46,6 +45,7 @@ from .measurements import (
 )
 from .parameters import JointParameters
 from .prediction import chaser_prior
+from .running_update import RunningUpdate, running_update
 from .state import (
     ATTITUDE,
     ATTITUDE_DRIFT,
@@ -68,8 +68,6 @@ from .state import (
     VIEW,
     JointState,
     block,
-    mean_fields,
-    packed,
 )
 
 _POSE = (CHANNELS.index("position"), CHANNELS.index("attitude"))
@@ -121,9 +119,6 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
     measured = state.measured_ns.copy()
     measured[i] = state.time_ns
 
-    # The other states keep their estimates, but are no longer correlated with this chaser.
-    covariance = state.covariance.copy()
-    covariance[block(i), :] = covariance[:, block(i)] = 0.0
     own = np.zeros((CHASER, CHASER))
     e = np.arange(12, CHASER)
     own[e, e] = chaser_prior(p)
@@ -134,10 +129,10 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
         prior = own[drift, drift].copy()
         own[part, part] += prior
         own[part, drift] = own[drift, part] = -prior
-    covariance[block(i), block(i)] = own
 
     return replace(
-        state,
+        # The other states keep their estimates, but are no longer correlated with this chaser.
+        with_started_chaser(state, i, own),
         positions_m=positions,
         velocities_m_s=velocities,
         attitudes_wxyz=attitudes,
@@ -147,23 +142,23 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
         measured_ns=measured,
         rejections=rejections,
         nis=nis,
-        covariance=covariance,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class SightedPose:
-    """Pose of the target by one sighting and the chaser's estimated state.
+    """Pose of the target by one sighting and the estimated state of ``chaser``.
 
     position_m (3,): origin of TRF in WRF. q_wxyz (4,): TRF to WRF. covariance (6, 6): of position
-    (WRF axes) and dtheta (TRF axes), q_true = q (x) exp(dtheta). cross (6, D): covariance of this
-    error with the error vector.
+    (WRF axes) and dtheta (TRF axes), q_true = q (x) exp(dtheta). by_chaser (6, CHASER): negative of
+    the derivatives of this error by the chaser's.
     """
 
     position_m: Array
     q_wxyz: Array
     covariance: Array
-    cross: Array
+    chaser: int
+    by_chaser: Array
 
     def agrees(self, other: SightedPose, gate: float) -> bool:
         """Test whether another pose at the same time differs by no more than the gate."""
@@ -196,10 +191,8 @@ def sighted_pose(
     ratios = p.sighting_noise(markers)
     noise = (ratios.white_ratio**2 + ratios.view_ratio**2) * sighting_covariance(solution, p)
     by_chaser = to_pose @ predicted.by_chaser
-    cross = -by_chaser @ state.covariance[block(i), :]
-    own = state.covariance[block(i), block(i)]
-    covariance = by_chaser @ own @ by_chaser.T + to_pose @ noise @ to_pose.T
-    return SightedPose(position, moved.q_wxyz, 0.5 * (covariance + covariance.T), cross)
+    covariance = by_chaser @ of_chaser(state, i) @ by_chaser.T + to_pose @ noise @ to_pose.T
+    return SightedPose(position, moved.q_wxyz, 0.5 * (covariance + covariance.T), i, by_chaser)
 
 
 def start_target(
@@ -209,85 +202,22 @@ def start_target(
 
     ``scale``: factor on the covariance of the pose.
     """
-    covariance = state.covariance.copy()
-    covariance[:TARGET, :] = covariance[:, :TARGET] = 0.0
-    cross = pose.cross.copy()
-    cross[:, :TARGET] = 0.0
-    covariance[POSE, :], covariance[:, POSE] = cross, cross.T
-    covariance[np.ix_(POSE, POSE)] = pose.covariance * scale
-    covariance[np.ix_(RATES, RATES)] = rates.covariance
+    own = np.zeros((TARGET, TARGET))
+    own[np.ix_(POSE, POSE)] = pose.covariance * scale
+    own[np.ix_(RATES, RATES)] = rates.covariance
     rejections = state.rejections.copy()
     rejections[:, SIGHTING_CHANNEL] = 0
     return replace(
-        state,
+        with_started_target(state, pose.chaser, pose.by_chaser, own),
         position_m=pose.position_m,
         q_wxyz=pose.q_wxyz,
         velocity_m_s=rates.velocity_m_s,
         omega_rad_s=rates.omega_rad_s,
-        covariance=covariance,
         log_likelihood=0.0,
         target_known=True,
         updates=0,
         rejections=rejections,
     )
-
-
-class RunningUpdate:
-    """State while the chasers of a tick are processed one by one. Its arrays change; those of
-    ``state`` do not.
-
-    covariance (D, D): only the lower triangle is valid. rejections, nis, log_likelihood: as in
-    ``JointState``.
-    """
-
-    def __init__(self, state: JointState) -> None:
-        self.state, self.mean, self.covariance = state, packed(state), state.covariance.copy()
-        kernels.check_size(self.mean, self.covariance)
-        self.rejections, self.nis = state.rejections.copy(), state.nis.copy()
-        self.log_likelihood = state.log_likelihood
-        self.shape = state.shape
-        self.innovation = kernels.JointInnovation(state.chasers, len(self.covariance))
-
-    def values(self, z: kernels.NativeMeasurement) -> list[float]:
-        """Compute the innovation of a measurement. Returns for each channel the squared normalized
-        residual, then the determinant of the sighting's innovation covariance.
-        """
-        self.innovation.innovate(z, self.mean, self.mean, self.covariance)
-        return self.innovation.values.tolist()
-
-    def correct(
-        self, z: kernels.NativeMeasurement, used: NDArray[np.int64], iterations: int
-    ) -> None:
-        """Update by the rows ``used`` of the last innovation, relinearized up to ``iterations``
-        times.
-
-        Raises numpy.linalg.LinAlgError for an innovation covariance that is not positive definite.
-        """
-        innovation, prior = self.innovation, self.mean
-        self.mean = np.empty_like(prior)
-        for k in range(iterations):
-            if k:
-                innovation.innovate(z, self.mean, prior, self.covariance)
-            if not innovation.correct(z, used, prior, self.mean):
-                raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
-        innovation.reduce(z, len(used), self.covariance)
-        if self.shape is not None:
-            self.shape = self.shape.corrected(innovation.correction[-SHAPE:])
-
-    def finished(self, updates: int, markers: NDArray[np.int64]) -> JointState:
-        """Return the state after the updates, with these fields."""
-        kernels.complete(self.covariance)
-        return replace(
-            self.state,
-            covariance=self.covariance,
-            shape=self.shape,
-            rejections=self.rejections,
-            nis=self.nis,
-            log_likelihood=self.log_likelihood,
-            updates=updates,
-            markers=markers,
-            **mean_fields(self.mean),
-        )
 
 
 def with_view_units(
@@ -343,7 +273,7 @@ def update(
     rejected: list[int] = []
     innovations: list[Innovation] = []
     state = with_view_units(state, sightings, p)
-    running, measured = RunningUpdate(state), state.measured_ns.copy()
+    running, measured = running_update(state), state.measured_ns.copy()
     # If most cameras disagree with the estimate, the target has moved.
     disagreeing = sum(bool(state.rejections[i, SIGHTING_CHANNEL]) for i in sightings)
     new_views = 2 * disagreeing <= len(sightings)
@@ -409,16 +339,13 @@ def _update_chaser(
 
     ``new_views``: follow errors of views that jump.
     """
-    chasers, markers = (
-        running.state.chasers,
-        len(sighting.marker_ids) if sighting is not None else 0,
-    )
+    place, markers = running.place(i), len(sighting.marker_ids) if sighting is not None else 0
     solution = _likeliest(running, i, sighting, mounting, p)
     if odometry is None and solution is None:
         return None
 
     view = _view_units(running.state, i, markers, p)
-    z = measurement(chasers, i, odometry, solution, markers, mounting, p, view)
+    z = measurement(*place, odometry, solution, markers, mounting, p, view)
     channels = _channels(
         odometry is not None, solution is not None, p.gate_sighting, p.gate_odometry
     )
@@ -480,7 +407,7 @@ def _unexpected_motion(i: int, running: RunningUpdate, p: JointParameters) -> Ar
     """Return the variances (D,) that an uncommanded force and torque within a tick add to chaser
     ``i``.
     """
-    variances, own = np.zeros(len(running.covariance)), block(i).start
+    variances, own = np.zeros(len(running.covariance)), block(running.place(i)[1]).start
     for part, sigma in (
         (VELOCITY, p.unexpected_velocity_m_s),
         (POSITION, p.unexpected_velocity_m_s * p.tick_s),
@@ -497,7 +424,7 @@ def _new_view(i: int, running: RunningUpdate) -> Array:
     """Return the variances (D,) to add to the view error of chaser ``i`` so that it is unknown
     again.
     """
-    variances, own = np.zeros(len(running.covariance)), block(i).start
+    variances, own = np.zeros(len(running.covariance)), block(running.place(i)[1]).start
     variances[own + VIEW.start : own + VIEW.stop] = 1.0
     return variances
 
@@ -544,7 +471,7 @@ def _likeliest(
     def log_density(solution: PoseSolution) -> float:
         markers = len(sighting.marker_ids)
         view = _view_units(running.state, i, markers, p)
-        z = measurement(running.state.chasers, i, None, solution, markers, mounting, p, view)
+        z = measurement(*running.place(i), None, solution, markers, mounting, p, view)
         values = running.values(z)
         return -0.5 * (values[SIGHTING_CHANNEL] + math.log(values[-1]))
 

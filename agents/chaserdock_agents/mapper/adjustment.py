@@ -121,11 +121,11 @@ def in_cameras(
     offset -= np.einsum("mij,mj->mi", to_camera, error[:, 3:6])
     matrix = from_w @ turned
     points = estimate.landmarks_m[seen.landmark]
-    return np.einsum("kij,kj->ki", matrix[seen.view], points) + offset[seen.view]
+    return (matrix[seen.view] @ points[:, :, None])[:, :, 0] + offset[seen.view]
 
 
 def residuals(problem: Problem, estimate: Estimate) -> Array:
-    """Return residuals (k, 2), px; large ones for landmarks behind a camera."""
+    """Return weighted residuals (k, 2), px; large ones for landmarks behind a camera."""
     y = in_cameras(problem, estimate)
     return _residuals(problem, estimate, y)
 
@@ -134,7 +134,7 @@ def _residuals(problem: Problem, estimate: Estimate, y: Array) -> Array:
     depth = np.maximum(y[:, 2:], _LEAST_DEPTH_M)
     seen = problem.observations
     focal = 1.0 + estimate.cameras[problem.views.chaser[seen.view], 6:7]
-    return problem.focal_px * (focal * y[:, :2] / depth - seen.rays)
+    return (problem.focal_px * seen.weight)[:, None] * (focal * y[:, :2] / depth - seen.rays)
 
 
 _LEAST_DEPTH_M = 0.02
@@ -154,6 +154,7 @@ def _linearize(problem: Problem, estimate: Estimate) -> _Linearized:
     by_y = np.zeros((len(y), 2, 3))
     by_y[:, 0, 0] = by_y[:, 1, 1] = focal / depth
     by_y[:, :, 2] = -(focal / depth**2)[:, None] * y[:, :2]
+    by_y *= seen.weight[:, None, None]
     by_w = by_y @ from_w[seen.view]
     by_landmark = by_w @ turned[seen.view]
     jr = right_jacobian(motion.omega_rad_s * after[:, None]) * after[:, None, None]
@@ -166,7 +167,7 @@ def _linearize(problem: Problem, estimate: Estimate) -> _Linearized:
     out[:, :, 6:9] = by_rate
     out[:, :, 9:12] = out[:, :, 16:19] = by_turn
     out[:, :, 12:15] = -by_y @ to_camera[seen.view]
-    out[:, :, 15] = problem.focal_px * y[:, :2] / depth[:, None]
+    out[:, :, 15] = problem.focal_px * y[:, :2] * (seen.weight / depth)[:, None]
     return _Linearized(_residuals(problem, estimate, y), out, by_landmark)
 
 
@@ -195,7 +196,7 @@ class _Normal:
             (np.ones(len(seen.view)), (seen.landmark, np.arange(len(seen.view)))),
             shape=(landmarks, len(seen.view)),
         )
-        cross = np.einsum("kai,kaj->kij", a, b)
+        cross = a.transpose(0, 2, 1) @ b
         w = np.zeros((size, landmarks, 3))
         w[:MOTION] = _gathered(gather, cross[:, :MOTION]).transpose(1, 0, 2)
         for chaser in range(chasers):
@@ -205,8 +206,8 @@ class _Normal:
             w[at : at + CAMERA] = _gathered(gather, part).transpose(1, 0, 2)
         turn_rows = first_turn + TURN * seen.view[:, None] + np.arange(TURN)
         w[turn_rows, seen.landmark[:, None]] = cross[:, MOTION + CAMERA :]
-        self.v = _gathered(gather, np.einsum("kai,kaj->kij", b, b))
-        self.h = _gathered(gather, np.einsum("kai,ka->ki", b, r)[:, :, None])[:, :, 0]
+        self.v = _gathered(gather, b.transpose(0, 2, 1) @ b)
+        self.h = _gathered(gather, b.transpose(0, 2, 1) @ r[:, :, None])[:, :, 0]
         sigma = _prior_sigmas(problem)
         off = np.concatenate(
             [
@@ -234,7 +235,8 @@ class _Normal:
         v = self.v + np.eye(3) * _FLOOR
         v = v + np.eye(3) * (damping * np.einsum("nii->ni", v)[:, None, :])
         lower = np.linalg.inv(np.linalg.cholesky(v))
-        whitened = np.einsum("anj,nij->ani", self.w, lower).reshape(len(self.u), -1)
+        whitened = self.w.transpose(1, 0, 2) @ lower.transpose(0, 2, 1)
+        whitened = whitened.transpose(1, 0, 2).reshape(len(self.u), -1)
         inverse = lower.transpose(0, 2, 1) @ lower
         s = self.u + np.diag(damping * np.diag(self.u)) - whitened @ whitened.T
         rhs = self.g - whitened @ np.einsum("nij,nj->ni", lower, self.h).ravel()
@@ -244,7 +246,7 @@ class _Normal:
         """Return the step of motion, cameras and views (a,), and that of the landmarks (n, 3)."""
         s, rhs, inverse = self.reduced(damping)
         first = -cho_solve(cho_factor(s, lower=True), rhs)
-        rest = self.h + np.einsum("anj,a->nj", self.w, first)
+        rest = self.h + (first @ self.w.reshape(len(first), -1)).reshape(-1, 3)
         return first, -np.einsum("nij,nj->ni", inverse, rest)
 
 
@@ -360,7 +362,8 @@ def _described(
     covariance = cho_solve(factor, np.eye(count))
     few = MOTION + CAMERA * len(problem.cameras)
     n = len(estimate.landmarks_m)
-    by_first = np.einsum("ani,nij->anj", normal.w, inverse)  # landmark = -by_first' first
+    # A landmark follows the other unknowns by -by_first'.
+    by_first = (normal.w.transpose(1, 0, 2) @ inverse).transpose(1, 0, 2)
     # Turns of the views are left out of the landmarks' covariances: they average out.
     by_few = by_first[:few].transpose(1, 2, 0)
     landmark = inverse + by_few @ covariance[:few, :few] @ by_few.transpose(0, 2, 1)
@@ -404,7 +407,7 @@ def triangulate(problem: Problem, estimate: Estimate, count: int) -> tuple[Array
     )
     from_centre = np.einsum("kij,kj->ki", across, centre[seen.view])
     points = np.zeros((count, 3))
-    weight = np.ones(len(rays))
+    weight = seen.weight**2
     for _ in range(_TRIANGULATIONS):
         matrix = _gathered(gather, across * weight[:, None, None])
         vector = _gathered(gather, (from_centre * weight[:, None])[:, :, None])[:, :, 0]
@@ -412,10 +415,10 @@ def triangulate(problem: Problem, estimate: Estimate, count: int) -> tuple[Array
         points = np.linalg.solve(matrix, vector[:, :, None])[:, :, 0]
         away = points[seen.landmark] - centre[seen.view]
         depth = np.maximum(np.einsum("ki,ki->k", away, direction), _LEAST_DEPTH_M)
-        off_px = problem.focal_px * np.linalg.norm(
+        off_px = problem.focal_px * seen.weight * np.linalg.norm(
             np.einsum("kij,kj->ki", across, away), axis=1
         ) / depth
-        weight = (problem.focal_px / depth) ** 2 / (1.0 + (off_px / _TRIANGULATION_PX) ** 2)
+        weight = (problem.focal_px * seen.weight / depth) ** 2 / (1.0 + (off_px / _TRIANGULATION_PX) ** 2)
     information = _gathered(gather, across * weight[:, None, None]) / problem.noise_px**2
     least = np.linalg.eigvalsh(information)[:, 0]
     sigma = np.where(least > 0.0, 1.0 / np.sqrt(np.maximum(least, 1e-12)), np.inf)

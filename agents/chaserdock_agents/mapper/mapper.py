@@ -70,6 +70,10 @@ class MapperTuning:
     """Landmarks whose median residual is larger slide along edges or shadows."""
     first_residual_px: float = 4.0
     """The same before a start is adjusted."""
+    fresh_px: float = 0.3
+    slide_px_s: float = 0.15
+    """Standard deviation of a point at first, and its slide: 0.06 px/s on the grid of solar cells,
+    0.3 px/s on foil, whose shading follows the light (docs/evidence/unknown.md)."""
     noise_px: float = 0.8
     """Noise of a coordinate as if views were independent. Points stray by 0.25 px, but alike in
     some ten views in a row, and neighbours together (NEES: docs/evidence/unknown.md)."""
@@ -143,6 +147,18 @@ class Mapper:
     def motion(self) -> ConstantRates | None:
         """The motion as last estimated, None before a map."""
         return None if self._last is None else self._last.estimate.motion
+
+    def known_points(self, chaser: int) -> tuple[IntArray, Array]:
+        """Return the ids (n,), ascending, of a chaser's tracks that are landmarks, and where these
+        are, (n, 3), TRF.
+        """
+        if self._last is None:
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        ids = np.unique(np.concatenate([v.ids for v in self._views[chaser]]))
+        roots = self._merges.roots(_keys(chaser, ids))
+        at = np.minimum(np.searchsorted(self._keys, roots), len(self._keys) - 1)
+        mapped = self._keys[at] == roots
+        return ids[mapped], self._last.estimate.landmarks_m[at[mapped]]
 
     def add(self, tracks: ImageTracks) -> None:
         """Take the points of one image; images of a chaser come in the order of time."""
@@ -275,9 +291,13 @@ class Mapper:
             ]
             start = Estimate(last.motion, last.cameras, np.array(turns), last.landmarks_m)
             part, start, selected = self._selected(
-                problem, start, keys, self.tuning.residual_px, chosen
+                problem, start, keys, self.tuning.first_residual_px, chosen
             )
-            found = None if part is None else adjust(part, start)
+            found = None
+            if part is not None:
+                # Wide first: what is seen again after a turn disagrees with all tracks at once.
+                wide = adjust(part, start, AdjustmentTuning(robust_px=4.0, steps=4))
+                found = wide and adjust(part, wide.estimate)
             if part is None or found is None:
                 return TargetMap(time_s, "inconsistent")
             adjusted, chosen = found, selected
@@ -333,7 +353,9 @@ class Mapper:
             np.array([v.position_w_m for v in images]),
             np.array([v.rotation for v in images]),
         )
-        seen = Observations(number, landmark, rays, tracks).by_landmark(place, enough)
+        ages_s = np.concatenate([v.ages_s for v in images])
+        weight = 1.0 / np.hypot(1.0, ages_s * self.tuning.slide_px_s / self.tuning.fresh_px)
+        seen = Observations(number, landmark, rays, tracks, weight).by_landmark(place, enough)
         return views, seen, unique[enough]
 
     def _selected(

@@ -87,14 +87,16 @@ _PARALLEL = 0.01
 
 
 def motion_px(windows: Sequence[Sequence[ImageTracks]], focal_px: float) -> float:
-    """Return the median motion, px, of the tracks in common between first and last images of the
-    chasers' windows.
+    """Return the median motion, px, of tracks from their first to their last image in the chasers'
+    windows.
     """
     moved = [np.zeros(0)]
     for images in windows:
-        if len(images) > 1:
-            a, b = shared(images[0], images[-1])
-            moved.append(focal_px * np.linalg.norm(b - a, axis=1))
+        ids = np.concatenate([image.ids for image in images])
+        rays = np.concatenate([image.rays for image in images])
+        _, first = np.unique(ids, return_index=True)
+        _, last = np.unique(ids[::-1], return_index=True)
+        moved.append(focal_px * np.linalg.norm(rays[::-1][last] - rays[first], axis=1))
     every = np.concatenate(moved)
     return float(np.median(every)) if len(every) else 0.0
 

@@ -22,7 +22,7 @@ class ImageTracks:
 
     ``position_w_m`` (3,), ``rotation`` (3, 3), IRF to WRF: optical centre and attitude of the
     camera by odometry and calibration. ``ids`` (n,): of tracks, per chaser. ``rays`` (n, 2):
-    normalized coordinates of their ideal pixels.
+    normalized coordinates of their ideal pixels. ``ages_s`` (n,): how long each was followed.
     """
 
     chaser: int
@@ -31,6 +31,7 @@ class ImageTracks:
     rotation: Array
     ids: IntArray
     rays: Array
+    ages_s: Array
 
 
 @dataclass(frozen=True)
@@ -86,19 +87,19 @@ class Views(NamedTuple):
 
 class Observations(NamedTuple):
     """The k points of an adjustment, by view: view (k,), landmark (k,), normalized coordinates
-    (k, 2), key of the track (k,).
+    (k, 2), key of the track (k,), weight (k,): standard deviation of a new point over that of this
+    one.
     """
 
     view: IntArray
     landmark: IntArray
     rays: Array
     track: IntArray
+    weight: Array
 
     def part(self, chosen: Array | IntArray) -> Observations:
         """Return the chosen observations."""
-        return Observations(
-            self.view[chosen], self.landmark[chosen], self.rays[chosen], self.track[chosen]
-        )
+        return Observations(*(column[chosen] for column in self))
 
     def by_landmark(self, place: IntArray, kept: Array) -> Observations:
         """Return the observations of ``kept`` (n,) landmarks, with their places among these."""

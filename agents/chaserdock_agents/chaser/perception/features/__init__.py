@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 from .description import PointDescriptions, describe
+from .memory import KnownTarget, TargetMotion
 from .tracker import BYTES_PER_POINT, FeatureTracker, TrackedPoints, TrackingTuning
 
 __all__ = [
     "BYTES_PER_POINT",
     "FeatureTracker",
+    "KnownTarget",
     "PointDescriptions",
+    "TargetMotion",
     "TrackedPoints",
     "TrackingTuning",
     "describe",

@@ -20,8 +20,10 @@ from chaserdock_models.camera import Camera
 from chaserdock_protocol.pose_image import UnusableImage
 from numpy.typing import ArrayLike, NDArray
 
+from .memory import KnownTarget, ViewMemory
+
 BYTES_PER_POINT = 9
-"""Size of a published point: id (4), two coordinates in 1/64 px (2 each), quality (1)."""
+"""Size of a published point: id (4), two coordinates in 1/64 px (2 each), age in 0.2 s (1)."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,9 @@ class TrackingTuning:
     still_images: int = 25
     """Images after which a point that has not moved is given up, and no other is sought there for
     as long: five seconds."""
+    same_px: float = 5.0
+    """Distance within which a point that is followed is the one found again there: half of
+    ``least_distance_px``."""
     margin_px: int = 60
     """New points are sought so far around those that move: a part of 0.15 m at 2 m that shows no
     corner yet."""
@@ -69,13 +74,14 @@ class TrackingTuning:
 @dataclass(frozen=True, eq=False)
 class TrackedPoints:
     """Points of one image: ``ids`` (n,), ascending, never reused; ``px`` (n, 2), ideal pixels;
-    ``quality`` (n,): distance, px, between a point's reference and where tracking back from this
-    image ends.
+    ``ages_s`` (n,): how long each was followed on the side of the target that is in view. Points
+    slide while they are followed: on shading, edges and repeated patterns. A point found again
+    after a turn has the age that it had when it was last seen so.
     """
 
     ids: IntArray
     px: Array
-    quality: Array
+    ages_s: Array
 
 
 class FeatureTracker:
@@ -86,11 +92,12 @@ class FeatureTracker:
 
     def __init__(self, camera: Camera, tuning: TrackingTuning | None = None) -> None:
         self.camera, self.tuning = camera, tuning or TrackingTuning()
+        self._memory = ViewMemory(camera)
         self._equalize = cv2.createCLAHE(self.tuning.clip, (self.tuning.tiles, self.tuning.tiles))
         self._next_id, self._age = 0, 0
         self._reference: NDArray[np.uint8] | None = None
         self._referenced = 0
-        self._quality = np.zeros(0)
+        self._since_s = np.zeros(0)
         self._ids = np.zeros(0, dtype=np.int64)
         self._reference_px = np.zeros((0, 2), dtype=np.float32)
         self._px = np.zeros((0, 2), dtype=np.float32)
@@ -104,12 +111,16 @@ class FeatureTracker:
     def track(
         self,
         image: NDArray[np.uint8],
+        time_s: float,
+        position_w_m: ArrayLike,
         q_w_irf_wxyz: ArrayLike,
+        known: KnownTarget | None = None,
         excluded: Sequence[tuple[float, float, float]] = (),
     ) -> TrackedPoints:
         """Return the points of the target in a grey image (h, w), uint8.
 
-        ``q_w_irf_wxyz``: attitude of the camera by odometry. ``excluded``: discs (x, y, radius),
+        ``position_w_m`` (3,), ``q_w_irf_wxyz`` (4,): pose of the camera by odometry. ``known``:
+        what the mapper knows, by which old points are found again. ``excluded``: discs (x, y, radius),
         px, in which nothing is followed: other chasers and the own probe. Raises UnusableImage for
         an image of another size or type.
         """
@@ -127,12 +138,21 @@ class FeatureTracker:
             or self._age >= self.tuning.reference_images
             or share < self.tuning.reference_share
         ):
-            self._take_reference(equalized, q_w_irf_wxyz, excluded)
+            place, rotation = np.asarray(position_w_m, dtype=float), rotations.to_matrix(q_w_irf_wxyz)
+            if known is not None:
+                ids, px, ages_s = self._memory.recall(equalized, time_s, place, rotation, known)
+                self._recall(ids, px, time_s - ages_s)
+            self._take_reference(equalized, time_s, q_w_irf_wxyz, excluded)
+            moving = self._moves
+            self._memory.remember(
+                equalized, self._ids[moving], self._px[moving], time_s - self._since_s[moving],
+                time_s, place, rotation, known,
+            )  # fmt: skip
         published = np.flatnonzero(self._moves)
         return TrackedPoints(
             self._ids[published],
             self.camera.undistort(self._px[published]),
-            self._quality[published],
+            time_s - self._since_s[published],
         )
 
     def _follow(self, image: NDArray[np.uint8]) -> None:
@@ -155,11 +175,10 @@ class FeatureTracker:
         inside = ((found > border) & (found < size - 1 - border)).all(axis=1)
         kept = (good.ravel() > 0) & (back_good.ravel() > 0) & (off < tuning.return_px) & inside
         self._step_px, self._px = found - self._px, found
-        self._quality = off
         self._keep(kept)
         self._images += 1
 
-    def _keep(self, kept: NDArray[np.bool_]) -> None:
+    def _keep(self, kept: NDArray[np.bool_] | IntArray) -> None:
         for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[kept])
 
@@ -194,6 +213,7 @@ class FeatureTracker:
     def _take_reference(
         self,
         image: NDArray[np.uint8],
+        time_s: float,
         q_w_irf_wxyz: ArrayLike,
         excluded: Sequence[tuple[float, float, float]],
     ) -> None:
@@ -220,19 +240,61 @@ class FeatureTracker:
         imaged = np.isfinite(ideal).all(axis=1)
         px, ideal, count = px[imaged], ideal[imaged], int(imaged.sum())
         rays = np.column_stack([self.camera.normalized(ideal), np.ones(count)])
-        self._ids = np.concatenate([self._ids, self._next_id + np.arange(count)])
+        self._append(
+            self._next_id + np.arange(count), px, ideal, rotations.rotate(q_w_irf_wxyz, rays), False,
+            np.full(count, time_s),
+        )  # fmt: skip
         self._next_id += count
-        self._px = np.concatenate([self._px, px])
+        order = np.argsort(self._ids, kind="stable")
+        self._keep(order)
         self._reference_px = self._px.copy()
-        self._step_px = np.concatenate([self._step_px, np.zeros((count, 2), np.float32)])
-        self._birth_px = np.concatenate([self._birth_px, ideal])
-        self._birth_w = np.concatenate([self._birth_w, rotations.rotate(q_w_irf_wxyz, rays)])
-        self._quality = np.concatenate([self._quality, np.zeros(count)])
-        self._images = np.concatenate([self._images, np.zeros(count, dtype=np.int64)])
-        self._moves = np.concatenate([self._moves, np.zeros(count, dtype=bool)])
         self._age = 0
         self._reference = image
         self._referenced = len(self._ids)
+
+    def _append(
+        self,
+        ids: IntArray,
+        px: NDArray[np.float32],
+        ideal: Array,
+        rays_w: Array,
+        moves: bool,
+        since_s: Array,
+    ) -> None:
+        count = len(ids)
+        self._ids = np.concatenate([self._ids, ids])
+        self._px = np.concatenate([self._px, px])
+        self._reference_px = np.concatenate([self._reference_px, px])
+        self._step_px = np.concatenate([self._step_px, np.zeros((count, 2), np.float32)])
+        self._birth_px = np.concatenate([self._birth_px, ideal])
+        self._birth_w = np.concatenate([self._birth_w, rays_w])
+        self._since_s = np.concatenate([self._since_s, since_s])
+        self._images = np.concatenate([self._images, np.zeros(count, dtype=np.int64)])
+        self._moves = np.concatenate([self._moves, np.full(count, moves)])
+
+    def _recall(self, ids: IntArray, px: NDArray[np.float32], since_s: Array) -> None:
+        """Go on with old points where they were found again.
+
+        A younger point at the same place ends: it is the same one. An old point that is still
+        followed loses the errors that added up.
+        """
+        if not len(ids):
+            return
+        _, active, again = np.intersect1d(self._ids, ids, return_indices=True)
+        near = np.linalg.norm(self._px[active] - px[again], axis=1) < self.tuning.same_px
+        self._px[active[near]] = px[again[near]]
+        self._since_s[active[near]] = since_s[again[near]]
+        new = np.ones(len(ids), dtype=bool)
+        new[again] = False
+        ids, px, since_s = ids[new], px[new], since_s[new]
+        off = np.linalg.norm(self._px[:, None] - px, axis=2) if len(px) else np.zeros((0, 0))
+        if len(px) and len(self._ids):
+            fresh = ~np.isin(np.arange(len(self._ids)), active)
+            self._keep(~((off < self.tuning.same_px).any(axis=1) & fresh))
+        room = max(self.tuning.most_points - len(self._ids), 0)
+        ids, px, since_s = ids[:room], px[:room], since_s[:room]
+        ideal = self.camera.undistort(px)
+        self._append(ids, px, ideal, np.tile([0.0, 0.0, 1.0], (len(ids), 1)), True, since_s)
 
     def _searched(self) -> tuple[int, int, int, int]:
         """Return left, top, right and bottom, px, of where new points are sought: around those
@@ -253,5 +315,5 @@ _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 """Lucas-Kanade ends after 20 steps or at a step of 0.01 px, a tenth of its error."""
 _COLUMNS = (
     "_ids", "_reference_px", "_px", "_step_px", "_birth_px", "_birth_w", "_images", "_moves",
-    "_quality",
+    "_since_s",
 )  # fmt: skip

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Adjust motion, cameras and landmarks to what cameras saw: bundle adjustment.
 
-Unknowns are the nine of the motion, seven of each chaser's camera, three of each view (noise of its
+Unknowns are the nine of the motion, nine of each chaser's camera, three of each view (noise of its
 attitude), and three of each landmark. Landmarks are eliminated (Schur complement); the others are
 few and solved densely. Levenberg-Marquardt with Cauchy weights.
 """
@@ -19,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from .types import CameraUncertainty, ConstantRates, Estimate, Observations, Views
 
-MOTION, CAMERA, TURN = 9, 7, 3
+MOTION, CAMERA, TURN = 9, 9, 3
 """Numbers of unknowns of the motion, of a chaser's camera and of a view."""
 
 
@@ -82,8 +82,8 @@ class Adjusted:
 
 @dataclass(frozen=True, eq=False)
 class _Linearized:
-    """Residuals (k, 2), px, and their derivatives by the 19 unknowns of motion, camera and view
-    (k, 2, 19) and by the landmark (k, 2, 3).
+    """Residuals (k, 2), px, and their derivatives by the 21 unknowns of motion, camera and view
+    (k, 2, 21) and by the landmark (k, 2, 3).
     """
 
     residual: Array
@@ -133,8 +133,9 @@ def residuals(problem: Problem, estimate: Estimate) -> Array:
 def _residuals(problem: Problem, estimate: Estimate, y: Array) -> Array:
     depth = np.maximum(y[:, 2:], _LEAST_DEPTH_M)
     seen = problem.observations
-    focal = 1.0 + estimate.cameras[problem.views.chaser[seen.view], 6:7]
-    return (problem.focal_px * seen.weight)[:, None] * (focal * y[:, :2] / depth - seen.rays)
+    error = estimate.cameras[problem.views.chaser[seen.view]]
+    off = problem.focal_px * ((1.0 + error[:, 6:7]) * y[:, :2] / depth - seen.rays)
+    return seen.weight[:, None] * (off + error[:, 7:9] * seen.age_s[:, None])
 
 
 _LEAST_DEPTH_M = 0.02
@@ -165,9 +166,10 @@ def _linearize(problem: Problem, estimate: Estimate) -> _Linearized:
     out[:, :, 0:3] = by_w
     out[:, :, 3:6] = by_w * after[seen.view, None, None]
     out[:, :, 6:9] = by_rate
-    out[:, :, 9:12] = out[:, :, 16:19] = by_turn
+    out[:, :, 9:12] = out[:, :, 18:21] = by_turn
     out[:, :, 12:15] = -by_y @ to_camera[seen.view]
     out[:, :, 15] = problem.focal_px * y[:, :2] * (seen.weight / depth)[:, None]
+    out[:, :, 16:18] = np.eye(2) * (seen.weight * seen.age_s)[:, None, None]
     return _Linearized(_residuals(problem, estimate, y), out, by_landmark)
 
 
@@ -264,7 +266,7 @@ def _prior_sigmas(problem: Problem) -> Array:
     tuning = AdjustmentTuning()
     motion = np.repeat([tuning.position_prior_m, tuning.velocity_prior_m_s, _RATE_PRIOR_RAD_S], 3)
     cameras = [
-        np.array([*[c.turn_rad] * 3, *[c.shift_m] * 3, c.focal_share]) for c in problem.cameras
+        np.array([*[c.turn_rad] * 3, *[c.shift_m] * 3, c.focal_share, *[_SLIDE_PX_S] * 2]) for c in problem.cameras
     ]
     noise = np.array([view_turn_sigma_rad(c) for c in problem.cameras])
     turns = np.repeat(noise[problem.views.chaser], 3)
@@ -278,6 +280,8 @@ def view_turn_sigma_rad(camera: CameraUncertainty) -> float:
     return float(np.hypot(camera.attitude_noise_rad, camera.position_noise_m / _USUAL_RANGE_M))
 
 
+_SLIDE_PX_S = 0.1
+"""Standard deviation of the mean slide of a camera's points: shading follows the light."""
 _RATE_PRIOR_RAD_S = 1.0
 """Standard deviation of the rate: no knowledge."""
 _LEAST_SIGMA = 1e-7

@@ -15,6 +15,7 @@ import numpy as np
 from chaserdock_models.arrays import Array, IntArray
 
 from .adjustment import (
+    CAMERA,
     Adjusted,
     AdjustmentTuning,
     Problem,
@@ -60,21 +61,22 @@ class MapperTuning:
     most_views: int = 120
     """Views kept of a chaser: beyond, every second of the older half goes. An adjustment of two
     chasers takes 0.5 s with as many (benchmarks/unknown.py)."""
-    most_landmarks: int = 1200
+    most_landmarks: int = 1000
     """Landmarks adjusted: those seen most often."""
     least_views: int = 4
     """Views that a landmark needs: two more than its unknowns fill."""
     landmark_sigma_m: float = 0.03
     """Landmarks less certain along their worst direction are left out: their error is not linear."""
-    residual_px: float = 1.5
+    residual_px: float = 0.8
     """Landmarks whose median residual is larger slide along edges or shadows."""
     first_residual_px: float = 4.0
     """The same before a start is adjusted."""
     fresh_px: float = 0.3
-    slide_px_s: float = 0.15
-    """Standard deviation of a point at first, and its slide: 0.06 px/s on the grid of solar cells,
-    0.3 px/s on foil, whose shading follows the light (docs/evidence/unknown.md)."""
-    noise_px: float = 0.8
+    slide_px_s: float = 0.05
+    """Standard deviation of a point at first, and its slide: 0.1 px/s on the grid of solar cells, 0.3
+    px/s on foil, whose shading follows the light (docs/evidence/unknown.md). Smaller than both, as
+    old points also tell what new ones do not."""
+    noise_px: float = 1.2
     """Noise of a coordinate as if views were independent. Points stray by 0.25 px, but alike in
     some ten views in a row, and neighbours together (NEES: docs/evidence/unknown.md)."""
     start_s: float = 4.0
@@ -103,7 +105,7 @@ class TargetMap:
     """What is known at ``time_s``.
 
     ``motion`` and what follows are None, empty or infinite without a map. ``covariance`` (9, 9): of
-    the motion's vector. ``cameras`` (chasers, 7): see `Estimate`. ``keys`` (n,): of landmarks,
+    the motion's vector. ``cameras`` (chasers, 9): see `Estimate`. ``keys`` (n,): of landmarks,
     ``landmarks_m`` (n, 3), TRF, ``covariances_m2`` (n, 3, 3). ``scale_share``: standard deviation
     of all distances.
     """
@@ -112,7 +114,7 @@ class TargetMap:
     status: Status
     motion: ConstantRates | None = None
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    cameras: Array = field(default_factory=lambda: np.zeros((0, 7)))
+    cameras: Array = field(default_factory=lambda: np.zeros((0, CAMERA)))
     keys: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     landmarks_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
     covariances_m2: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
@@ -178,9 +180,13 @@ class Mapper:
             out = out[:half:2] + out[half:]
         self._views[tracks.chaser] = out
 
-    def describe(self, chaser: int, ids: IntArray, values: Array) -> None:
-        """Take descriptions (n, 128) of tracks."""
-        self._merges.add(_keys(chaser, ids), values)
+    def kept_views(self) -> tuple[tuple[ImageTracks, ...], ...]:
+        """Return the views of each chaser that are kept, by time."""
+        return tuple(tuple(views) for views in self._views)
+
+    def describe(self, chaser: int, time_s: float, ids: IntArray, values: Array) -> None:
+        """Take descriptions (n, 128) of tracks in an image."""
+        self._merges.add(time_s, _keys(chaser, ids), values)
 
     def update(self, time_s: float) -> TargetMap:
         """Return the map from all that was added."""
@@ -251,7 +257,7 @@ class Mapper:
             views, observations, self._cameras, self._focal_px, prior, self.tuning.noise_px
         )
         estimate = Estimate(
-            motion, np.zeros((len(self._cameras), 7)), np.zeros((len(views.time_s), 3)),
+            motion, np.zeros((len(self._cameras), CAMERA)), np.zeros((len(views.time_s), 3)),
             np.zeros((0, 3)),
         )  # fmt: skip
         adjusted, chosen, limit = None, keys, self.tuning.first_residual_px
@@ -293,11 +299,14 @@ class Mapper:
             part, start, selected = self._selected(
                 problem, start, keys, self.tuning.first_residual_px, chosen
             )
-            found = None
-            if part is not None:
-                # Wide first: what is seen again after a turn disagrees with all tracks at once.
-                wide = adjust(part, start, AdjustmentTuning(robust_px=4.0, steps=4))
-                found = wide and adjust(part, wide.estimate)
+            # Wide first: what is seen again after a turn disagrees with all tracks at once.
+            wide = part and adjust(part, start, AdjustmentTuning(robust_px=4.0, steps=4))
+            if not wide:
+                return TargetMap(time_s, "inconsistent")
+            part, start, selected = self._selected(
+                problem, wide.estimate, keys, self.tuning.residual_px, selected
+            )
+            found = part and adjust(part, start)
             if part is None or found is None:
                 return TargetMap(time_s, "inconsistent")
             adjusted, chosen = found, selected
@@ -355,7 +364,7 @@ class Mapper:
         )
         ages_s = np.concatenate([v.ages_s for v in images])
         weight = 1.0 / np.hypot(1.0, ages_s * self.tuning.slide_px_s / self.tuning.fresh_px)
-        seen = Observations(number, landmark, rays, tracks, weight).by_landmark(place, enough)
+        seen = Observations(number, landmark, rays, tracks, weight, ages_s).by_landmark(place, enough)
         return views, seen, unique[enough]
 
     def _selected(

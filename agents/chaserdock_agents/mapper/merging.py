@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from .adjustment import Adjusted
 from .types import Observations
 
-Descriptions = dict[int, list[Array]]
-"""Descriptions (128,) of tracks by key, unit length."""
+Descriptions = dict[int, list[tuple[float, Array]]]
+"""Times, and descriptions (128,) of unit length, of tracks by key."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,13 @@ class MergingTuning:
     distance_m: float = 0.02
     """Largest distance of landmarks that may be one: three standard deviations of those seen in
     half a turn."""
-    unlike: float = 0.45
-    """Largest distance of unit descriptions: different points of the same texture have 0.6 and
-    more."""
-    kept: int = 3
-    """Descriptions kept of a track, the latest: a point looks different from other sides."""
+    unlike: float = 0.5
+    """Largest distance of unit descriptions: one in fifty pairs of different points is as alike, and
+    of these one in a thousand is within ``distance_m``."""
+    kept: int = 6
+    apart_s: float = 5.0
+    """Descriptions kept of a track, the latest, and the time between them, 16 degrees of turn: a
+    point looks different from other sides."""
     residual_px: float = 1.5
     """Median residual of a part of a merged landmark above which the merge is undone."""
 
@@ -51,12 +53,14 @@ class Merges:
         """Number of tracks that another one stands for."""
         return len(self._parent)
 
-    def add(self, keys: IntArray, values: Array) -> None:
-        """Take descriptions (n, 128) of tracks."""
+    def add(self, time_s: float, keys: IntArray, values: Array) -> None:
+        """Take descriptions (n, 128) of tracks at a time."""
         unit = np.asarray(values, dtype=np.float32)
         unit = unit / np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1.0)
         for key, value in zip(np.asarray(keys).tolist(), unit, strict=True):
-            self._descriptions[key] = [*self._descriptions.get(key, []), value][-self.tuning.kept :]
+            before = self._descriptions.get(key, [])
+            if not before or time_s - before[-1][0] > self.tuning.apart_s:
+                self._descriptions[key] = [*before, (time_s, value)][-self.tuning.kept :]
 
     def roots(self, keys: IntArray) -> IntArray:
         """Return the keys (n,) of the landmarks of tracks (n,)."""
@@ -76,7 +80,9 @@ class Merges:
         for key, root in self._parent.items():
             members.setdefault(root, []).append(key)
         described = {
-            root: [d for k in (root, *members.get(root, [])) for d in self._descriptions.get(k, [])]
+            root: [
+                d for k in (root, *members.get(root, [])) for _, d in self._descriptions.get(k, [])
+            ]
             for root in keys.tolist()
         }
         pairs = cKDTree(landmarks).query_pairs(self.tuning.distance_m, output_type="ndarray")

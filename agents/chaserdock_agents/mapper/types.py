@@ -88,7 +88,7 @@ class Views(NamedTuple):
 class Observations(NamedTuple):
     """The k points of an adjustment, by view: view (k,), landmark (k,), normalized coordinates
     (k, 2), key of the track (k,), weight (k,): standard deviation of a new point over that of this
-    one.
+    one, age (k,), s.
     """
 
     view: IntArray
@@ -96,6 +96,7 @@ class Observations(NamedTuple):
     rays: Array
     track: IntArray
     weight: Array
+    age_s: Array
 
     def part(self, chosen: Array | IntArray) -> Observations:
         """Return the chosen observations."""
@@ -111,8 +112,8 @@ class Observations(NamedTuple):
 class Estimate:
     """Unknowns of an adjustment.
 
-    ``cameras`` (chasers, 7): turn (3,) and shift (3,) in IRF, share of the focal length, against
-    the calibration. ``turns`` (m, 3): of each view against odometry, IRF. ``landmarks_m`` (n, 3),
+    ``cameras`` (chasers, 9): turn (3,) and shift (3,) in IRF, share of the focal length, against
+    the calibration, and mean slide (2,) of the points that it follows, px/s. ``turns`` (m, 3): of each view against odometry, IRF. ``landmarks_m`` (n, 3),
     TRF.
     """
 

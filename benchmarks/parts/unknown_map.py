@@ -13,6 +13,7 @@ is of velocity and rate (6), after a turn. Times are CPU times of this process.
 
 from __future__ import annotations
 
+import math
 import time
 from argparse import ArgumentParser
 from dataclasses import dataclass, replace
@@ -50,24 +51,24 @@ FALSE_SHARE = 0.1
 class MapOutcome:
     """Figures of one sequence; not a number where there is no map."""
 
-    first_s: float
-    first_rate_share: float
-    turn_rate_share: float
-    turn_nees: float
-    turn_scale_share: float
-    next_offset_m: float
-    next_offset_rad: float
-    next_position_m: float
-    next_angle_rad: float
-    next_rate_share: float
-    landmarks: float
-    landmark_median_m: float
-    landmark_p90_m: float
-    merges: float
     image_mean_s: float
     image_p95_s: float
     mapper_share: float
     bytes_per_s: float
+    first_s: float = math.nan
+    first_rate_share: float = math.nan
+    turn_rate_share: float = math.nan
+    turn_nees: float = math.nan
+    turn_scale_share: float = math.nan
+    next_offset_m: float = math.nan
+    next_offset_rad: float = math.nan
+    next_position_m: float = math.nan
+    next_angle_rad: float = math.nan
+    next_rate_share: float = math.nan
+    landmarks: float = math.nan
+    landmark_median_m: float = math.nan
+    landmark_p90_m: float = math.nan
+    merges: float = math.nan
 
 
 def uncertainty(images: UnknownImages) -> CameraUncertainty:
@@ -105,9 +106,7 @@ def fly(case: Case, folder: Path) -> MapOutcome:
         image_s.append(time.process_time() - begin_s)
         points += len(seen.ids)
         rays = camera.normalized(seen.px)
-        mapper.add(
-            ImageTracks(i, at_s, lens, rotations.to_matrix(q), seen.ids, rays, seen.ages_s)
-        )
+        mapper.add(ImageTracks(i, at_s, lens, rotations.to_matrix(q), seen.ids, rays, seen.ages_s))
         last_motion = mapper.motion
         if last_motion is not None and round(at_s * 5) % DESCRIBED_IMAGES == 0:
             begin_s = time.process_time()
@@ -132,10 +131,12 @@ def fly(case: Case, folder: Path) -> MapOutcome:
         known = [KnownTarget(found.motion, *mapper.known_points(k)) for k in range(chasers)]
         if after_turn is None and at_s >= case.turn_s:
             after_turn = found
-    nan = float("nan")
-    outcome = MapOutcome(*[nan] * 14, float(np.mean(image_s)), float(np.percentile(image_s, 95)),
-                         mapper_s / case.duration_s,
-                         BYTES_PER_POINT * points / case.duration_s / chasers)  # fmt: skip
+    outcome = MapOutcome(
+        float(np.mean(image_s)),
+        float(np.percentile(image_s, 95)),
+        mapper_s / case.duration_s,
+        BYTES_PER_POINT * points / case.duration_s / chasers,
+    )
     if first is None or last is None or after_turn is None or not times:
         return outcome
     errors = pose_errors(images, np.array(times), motions)
@@ -193,9 +194,7 @@ class PoseErrors:
     origin_m: Array
 
 
-def pose_errors(
-    images: UnknownImages, times_s: Array, motions: list[ConstantRates]
-) -> PoseErrors:
+def pose_errors(images: UnknownImages, times_s: Array, motions: list[ConstantRates]) -> PoseErrors:
     """Return the errors of the poses by ``motions`` at times (n,)."""
     found = [motion.at([at_s]) for motion, at_s in zip(motions, times_s, strict=True)]
     p, r = np.array([f[0][0] for f in found]), np.array([f[1][0] for f in found])
@@ -208,8 +207,9 @@ def pose_errors(
         tilt = _nearest((r @ turn @ true_r.transpose(0, 2, 1)).mean(axis=0))
     # p + r origin = true_p + offset, for constant origin and offset.
     rows = np.concatenate([r, -np.repeat(np.eye(3)[None], len(r), axis=0)], axis=2)
-    # Along the axis of rotation the two are one: the least solution shares it.
-    solved = np.linalg.lstsq(rows.reshape(-1, 6), (true_p - p).ravel(), rcond=_RANK)[0]
+    # Along the axis of rotation the two are one: it counts as the place of the origin.
+    rows = np.concatenate([rows.reshape(-1, 6), np.eye(6)[3:]])
+    solved = np.linalg.lstsq(rows, np.append((true_p - p).ravel(), np.zeros(3)), rcond=None)[0]
     origin, offset = solved[:3], solved[3:]
     varies = p + r @ origin - true_p - offset
     left = r @ turn @ (tilt @ true_r).transpose(0, 2, 1)
@@ -223,8 +223,8 @@ def pose_errors(
     )
 
 
-_ALIGNMENTS, _RANK = 20, 1e-2
-"""Repetitions until two rotations agree, and the share below which a direction is not determined."""
+_ALIGNMENTS = 20
+"""Repetitions until two rotations agree."""
 
 
 def _nearest(m: Array) -> Array:
@@ -281,14 +281,18 @@ def measure(options: Options) -> Figures:
     x, y, z = omega.tolist()
     sx, sy, sz = options.sun
     case = Case(mesh=options.mesh, to_sun=(sx, sy, sz), omega_rad_s=(x, y, z))
-    case = replace(case, duration_s=float(np.ceil((1.0 if options.quick else 2.0) * case.turn_s)) + 8)
+    case = replace(
+        case, duration_s=float(np.ceil((1.0 if options.quick else 2.0) * case.turn_s)) + 8
+    )
     key = {"mesh": case.mesh, "sun": list(case.to_sun), "omega": [round(v, 6) for v in (x, y, z)],
            "duration_s": case.duration_s}  # fmt: skip
     outcomes = KeptResults(options.results, key, MapOutcome).of(
         seeds_of(options, 20, 1),
         partial(_flown, case, options.images),
-        lambda o: f"first {o.first_s:.0f} s, rate {1e2 * o.turn_rate_share:.3f} %, next turn "
-        f"{1e3 * o.next_position_m:.2f} mm {np.rad2deg(o.next_angle_rad):.3f} deg",
+        lambda o: (
+            f"first {o.first_s:.0f} s, rate {1e2 * o.turn_rate_share:.3f} %, next turn "
+            f"{1e3 * o.next_position_m:.2f} mm {np.rad2deg(o.next_angle_rad):.3f} deg"
+        ),
         options.jobs,
     )
     rows = {name: np.array([getattr(o, name) for o in outcomes]) for name in _FIELDS}

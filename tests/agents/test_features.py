@@ -78,10 +78,10 @@ def test_equal_images_give_equal_points() -> None:
 def test_excluded_discs_hold_no_points() -> None:
     tracker = FeatureTracker(CAMERA, TUNING)
     disc = (150.0, 120.0, 40.0)
-    for k in range(10):
-        points = tracker.track(
-            plate(0.0, 2.0 * k), 0.2 * k, np.zeros(3), rotations.IDENTITY, None, [disc]
-        )
+    points = [
+        tracker.track(plate(0.0, 2.0 * k), 0.2 * k, np.zeros(3), rotations.IDENTITY, None, [disc])
+        for k in range(10)
+    ][-1]
     assert len(points.ids) > 5
     assert (np.linalg.norm(points.px - disc[:2], axis=1) > 39.0).all()
 
@@ -110,7 +110,7 @@ def shift_at(time_s: float) -> float:
 
 def test_points_are_found_again_under_their_old_ids() -> None:
     tracker = FeatureTracker(CAMERA, TUNING)
-    motion, first = Swinging(), None
+    motion, first, points = Swinging(), None, None
     for k in range(90):
         at_s = 0.2 * k
         hidden = 5.0 < at_s < 15.0
@@ -126,6 +126,7 @@ def test_points_are_found_again_under_their_old_ids() -> None:
         if first is None and len(points.ids) > 30 and at_s > 1.5:
             first = (at_s, points)
     assert first is not None
+    assert points is not None
     again, i, j = np.intersect1d(first[1].ids, points.ids, return_indices=True)
     assert len(again) > 10
     moved = points.px[j] - first[1].px[i]

@@ -46,7 +46,8 @@ def test_motion_is_recovered_with_a_consistent_covariance() -> None:
         error = error_of(found)
         nees.append(float(error @ np.linalg.solve(found.covariance[3:, 3:], error)))
         shares.append(np.linalg.norm(error[3:]) / np.linalg.norm(TRUE.omega_rad_s))
-    assert 3.0 < np.mean(nees) < 10.0  # of 6; 24 values: 6 +- 1.7
+    # Of 6, less two fifths: points with large residuals count for less.
+    assert 1.5 < np.mean(nees) < 9.0
     assert max(shares) < 0.01
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, IntArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
@@ -36,7 +36,7 @@ class AdjustmentTuning:
     """Residual with half weight: twice that of a good track."""
     position_prior_m: float = 0.5
     """Standard deviation of the first guess of the target's position: the cameras' lines of sight
-    to the middle of the moving points. It also fixes where TRF's origin is along the axis."""
+    to the middle of the moving points."""
     velocity_prior_m_s: float = 0.1
     """Standard deviation of the target's velocity against that of the chasers that hold beside
     it."""
@@ -47,7 +47,8 @@ class AdjustmentTuning:
 @dataclass(frozen=True, eq=False)
 class Problem:
     """What an adjustment starts from. ``focal_px``: of all cameras. ``prior``: motion with the
-    standard deviations of ``AdjustmentTuning``. ``noise_px``: of a coordinate, for independent
+    standard deviations of ``AdjustmentTuning``; along its axis of rotation it says where the origin
+    of TRF is. ``noise_px``: of a coordinate, for independent
     observations.
     """
 
@@ -220,10 +221,13 @@ class _Normal:
         )
         u[np.diag_indices(size)] += 1.0 / sigma**2
         g += off / sigma**2
+        axis = _gauge(problem)
+        u[:3, :3] += np.outer(axis, axis)
+        g[:3] += axis * (axis @ off[:3])
         self.u, self.g, self.w = u, g, w
 
     @staticmethod
-    def _places(chaser: int, view: int, first_turn: int) -> Array:
+    def _places(chaser: int, view: int, first_turn: int) -> IntArray:
         camera = MOTION + CAMERA * int(chaser)
         turn = first_turn + TURN * view
         return np.concatenate(
@@ -266,11 +270,24 @@ def _prior_sigmas(problem: Problem) -> Array:
     tuning = AdjustmentTuning()
     motion = np.repeat([tuning.position_prior_m, tuning.velocity_prior_m_s, _RATE_PRIOR_RAD_S], 3)
     cameras = [
-        np.array([*[c.turn_rad] * 3, *[c.shift_m] * 3, c.focal_share, *[_SLIDE_PX_S] * 2]) for c in problem.cameras
+        np.array([*[c.turn_rad] * 3, *[c.shift_m] * 3, c.focal_share, *[_SLIDE_PX_S] * 2])
+        for c in problem.cameras
     ]
     noise = np.array([view_turn_sigma_rad(c) for c in problem.cameras])
     turns = np.repeat(noise[problem.views.chaser], 3)
     return np.maximum(np.concatenate([motion, *cameras, turns]), _LEAST_SIGMA)
+
+
+def _gauge(problem: Problem) -> Array:
+    """Return the row (3,) that keeps the origin where the prior puts it along the first axis of
+    rotation: images do not tell where along the axis it is.
+    """
+    axis = problem.prior.omega_rad_s
+    return axis / max(float(np.linalg.norm(axis)), _LEAST_SIGMA) / _GAUGE_SIGMA_M
+
+
+_GAUGE_SIGMA_M = 1e-4
+"""Standard deviation of the origin along the axis: a convention, below all errors."""
 
 
 def view_turn_sigma_rad(camera: CameraUncertainty) -> float:
@@ -315,7 +332,8 @@ def _total(problem: Problem, estimate: Estimate, robust_px: float) -> float:
             estimate.turns.ravel(),
         ]
     )
-    return float(seen + ((off / _prior_sigmas(problem)) ** 2).sum())
+    prior = ((off / _prior_sigmas(problem)) ** 2).sum() + (_gauge(problem) @ off[:3]) ** 2
+    return float(seen + prior)
 
 
 def adjust(
@@ -410,19 +428,24 @@ def triangulate(problem: Problem, estimate: Estimate, count: int) -> tuple[Array
         shape=(count, len(seen.view)),
     )
     from_centre = np.einsum("kij,kj->ki", across, centre[seen.view])
-    points = np.zeros((count, 3))
+    points: Array = np.zeros((count, 3))
     weight = seen.weight**2
     for _ in range(_TRIANGULATIONS):
         matrix = _gathered(gather, across * weight[:, None, None])
         vector = _gathered(gather, (from_centre * weight[:, None])[:, :, None])[:, :, 0]
         matrix = matrix + np.eye(3) * 1e-9
-        points = np.linalg.solve(matrix, vector[:, :, None])[:, :, 0]
+        points = np.asarray(np.linalg.solve(matrix, vector[:, :, None])[:, :, 0], dtype=float)
         away = points[seen.landmark] - centre[seen.view]
         depth = np.maximum(np.einsum("ki,ki->k", away, direction), _LEAST_DEPTH_M)
-        off_px = problem.focal_px * seen.weight * np.linalg.norm(
-            np.einsum("kij,kj->ki", across, away), axis=1
-        ) / depth
-        weight = (problem.focal_px * seen.weight / depth) ** 2 / (1.0 + (off_px / _TRIANGULATION_PX) ** 2)
+        off_px = (
+            problem.focal_px
+            * seen.weight
+            * np.linalg.norm(np.einsum("kij,kj->ki", across, away), axis=1)
+            / depth
+        )
+        weight = (problem.focal_px * seen.weight / depth) ** 2 / (
+            1.0 + (off_px / _TRIANGULATION_PX) ** 2
+        )
     information = _gathered(gather, across * weight[:, None, None]) / problem.noise_px**2
     least = np.linalg.eigvalsh(information)[:, 0]
     sigma = np.where(least > 0.0, 1.0 / np.sqrt(np.maximum(least, 1e-12)), np.inf)

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
+from numpy.typing import NDArray
 
 from .adjustment import (
     CAMERA,
@@ -37,7 +38,13 @@ from .types import (
 )
 
 Status = Literal[
-    "gathering", "no texture", "does not turn", "ambiguous", "inconsistent", "scale unknown", "mapped"
+    "gathering",
+    "no texture",
+    "does not turn",
+    "ambiguous",
+    "inconsistent",
+    "scale unknown",
+    "mapped",
 ]
 """Why there is no map yet, or how good it is.
 
@@ -66,16 +73,16 @@ class MapperTuning:
     least_views: int = 4
     """Views that a landmark needs: two more than its unknowns fill."""
     landmark_sigma_m: float = 0.03
-    """Landmarks less certain along their worst direction are left out: their error is not linear."""
+    """Landmarks less certain along their worst direction are left out: errors are not linear."""
     residual_px: float = 0.8
     """Landmarks whose median residual is larger slide along edges or shadows."""
     first_residual_px: float = 4.0
     """The same before a start is adjusted."""
     fresh_px: float = 0.3
     slide_px_s: float = 0.05
-    """Standard deviation of a point at first, and its slide: 0.1 px/s on the grid of solar cells, 0.3
-    px/s on foil, whose shading follows the light (docs/evidence/unknown.md). Smaller than both, as
-    old points also tell what new ones do not."""
+    """Standard deviation of a point at first, and its slide: 0.1 px/s on the grid of solar cells,
+    0.3 px/s on foil, whose shading follows the light (docs/evidence/unknown.md). Smaller than
+    both, as old points also tell what new ones do not."""
     noise_px: float = 1.2
     """Noise of a coordinate as if views were independent. Points stray by 0.25 px, but alike in
     some ten views in a row, and neighbours together (NEES: docs/evidence/unknown.md)."""
@@ -184,7 +191,9 @@ class Mapper:
         """Return the views of each chaser that are kept, by time."""
         return tuple(tuple(views) for views in self._views)
 
-    def describe(self, chaser: int, time_s: float, ids: IntArray, values: Array) -> None:
+    def describe(
+        self, chaser: int, time_s: float, ids: IntArray, values: NDArray[np.uint8]
+    ) -> None:
         """Take descriptions (n, 128) of tracks in an image."""
         self._merges.add(time_s, _keys(chaser, ids), values)
 
@@ -215,10 +224,8 @@ class Mapper:
             [(w[-1].position_w_m - w[0].position_w_m) / (w[-1].time_s - w[0].time_s)
              for w in windows if len(w) > 1], axis=0,
         )  # fmt: skip
-        found = candidate_motions(
-            windows, self._focal_px, position, velocity, middle[0].time_s
-        )
-        tried = [self._tried(windows, m, ConstantRates(m.time_s, position, velocity, np.zeros(3)))
+        found = candidate_motions(windows, self._focal_px, position, velocity, middle[0].time_s)
+        tried = [self._tried(windows, m, ConstantRates(m.time_s, position, velocity, m.omega_rad_s))
                  for _, m in found]  # fmt: skip
         trials = sorted((t for t in tried if t is not None), key=lambda t: t[0])
         if not trials or trials[0][1] < tuning.start_share:
@@ -349,13 +356,6 @@ class Mapper:
         keys = self._merges.roots(tracks)
         number = np.repeat(np.arange(len(images)), [len(v.ids) for v in images])
         rays = np.concatenate([v.rays for v in images])
-        unique, landmark, counts = np.unique(keys, return_inverse=True, return_counts=True)
-        enough = counts >= self.tuning.least_views
-        if int(enough.sum()) > _MOST_TRACKS:
-            order = np.argsort(-counts, kind="stable")[:_MOST_TRACKS]
-            enough = np.zeros(len(counts), dtype=bool)
-            enough[order] = True
-        place = np.cumsum(enough) - 1
         views = Views(
             np.array([v.chaser for v in images]),
             np.array([v.time_s for v in images]),
@@ -363,8 +363,23 @@ class Mapper:
             np.array([v.rotation for v in images]),
         )
         ages_s = np.concatenate([v.ages_s for v in images])
+        # Of merged tracks that one view shows both, the younger point counts.
+        order = np.lexsort((ages_s, keys, number))
+        same = (np.diff(keys[order]) == 0) & (np.diff(number[order]) == 0)
+        single = np.sort(order[np.append(True, ~same)])
+        tracks, keys, number = tracks[single], keys[single], number[single]
+        rays, ages_s = rays[single], ages_s[single]
+        unique, landmark, counts = np.unique(keys, return_inverse=True, return_counts=True)
+        enough = counts >= self.tuning.least_views
+        if int(enough.sum()) > _MOST_TRACKS:
+            order = np.argsort(-counts, kind="stable")[:_MOST_TRACKS]
+            enough = np.zeros(len(counts), dtype=bool)
+            enough[order] = True
+        place = np.cumsum(enough) - 1
         weight = 1.0 / np.hypot(1.0, ages_s * self.tuning.slide_px_s / self.tuning.fresh_px)
-        seen = Observations(number, landmark, rays, tracks, weight, ages_s).by_landmark(place, enough)
+        seen = Observations(number, landmark, rays, tracks, weight, ages_s).by_landmark(
+            place, enough
+        )
         return views, seen, unique[enough]
 
     def _selected(
@@ -423,5 +438,3 @@ _MOST_TRACKS = 4000
 def _keys(chaser: int, ids: IntArray) -> IntArray:
     """Return keys (n,) of tracks, unique over all chasers."""
     return (np.int64(chaser) << np.int64(40)) + np.asarray(ids, dtype=np.int64)
-
-

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
-from scipy.spatial import cKDTree
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from .adjustment import Adjusted
 from .types import Observations
@@ -29,8 +30,8 @@ class MergingTuning:
     """Largest distance of landmarks that may be one: three standard deviations of those seen in
     half a turn."""
     unlike: float = 0.5
-    """Largest distance of unit descriptions: one in fifty pairs of different points is as alike, and
-    of these one in a thousand is within ``distance_m``."""
+    """Largest distance of unit descriptions: one in fifty pairs of different points is as alike,
+    and of these one in a thousand is within ``distance_m``."""
     kept: int = 6
     apart_s: float = 5.0
     """Descriptions kept of a track, the latest, and the time between them, 16 degrees of turn: a
@@ -53,7 +54,7 @@ class Merges:
         """Number of tracks that another one stands for."""
         return len(self._parent)
 
-    def add(self, time_s: float, keys: IntArray, values: Array) -> None:
+    def add(self, time_s: float, keys: IntArray, values: NDArray[np.uint8]) -> None:
         """Take descriptions (n, 128) of tracks at a time."""
         unit = np.asarray(values, dtype=np.float32)
         unit = unit / np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1.0)
@@ -85,7 +86,7 @@ class Merges:
             ]
             for root in keys.tolist()
         }
-        pairs = cKDTree(landmarks).query_pairs(self.tuning.distance_m, output_type="ndarray")
+        pairs = KDTree(landmarks).query_pairs(self.tuning.distance_m, output_type="ndarray")
         scored = []
         for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].tolist():
             a, b = int(keys[i]), int(keys[j])
@@ -104,8 +105,9 @@ class Merges:
         return made
 
     def check(self, seen: Observations, residual_px: Array, keys: IntArray) -> None:
-        """Undo merges of tracks that do not fit, and of landmarks that no longer do. ``residual_px``
-        (k,): of the observations.
+        """Undo merges of tracks that do not fit, and of landmarks that no longer do.
+
+        ``residual_px`` (k,): of the observations.
         """
         tracks, group = np.unique(seen.track, return_inverse=True)
         median = medians(residual_px, group, len(tracks))

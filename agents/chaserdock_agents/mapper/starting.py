@@ -79,7 +79,7 @@ def middle_of_lines(images: Sequence[ImageTracks]) -> Array | None:
         vector += across @ image.position_w_m
     if np.linalg.eigvalsh(matrix)[0] < _PARALLEL * max(len(images), 1):
         return None
-    return np.linalg.solve(matrix, vector)
+    return np.asarray(np.linalg.solve(matrix, vector), dtype=float)
 
 
 _PARALLEL = 0.01
@@ -198,7 +198,7 @@ def _refined(
     time_s: float,
     tuning: StartTuning,
 ) -> Array:
-    """Return all unknowns (h, 9) after Levenberg-Marquardt steps with derivatives by differences."""
+    """Return all unknowns (h, 9) after Levenberg-Marquardt steps, derivatives by differences."""
     sigma = np.repeat([tuning.position_sigma_m, tuning.velocity_sigma_m_s, 1.0], 3)
     step = np.repeat([1e-4, 1e-5, 1e-5], 3)
     damping = np.full(len(x), 1e-2)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, IntArray
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +98,18 @@ class Observations(NamedTuple):
     weight: Array
     age_s: Array
 
-    def part(self, chosen: Array | IntArray) -> Observations:
+    def part(self, chosen: NDArray[np.bool_]) -> Observations:
         """Return the chosen observations."""
-        return Observations(*(column[chosen] for column in self))
+        return Observations(
+            self.view[chosen],
+            self.landmark[chosen],
+            self.rays[chosen],
+            self.track[chosen],
+            self.weight[chosen],
+            self.age_s[chosen],
+        )
 
-    def by_landmark(self, place: IntArray, kept: Array) -> Observations:
+    def by_landmark(self, place: IntArray, kept: NDArray[np.bool_]) -> Observations:
         """Return the observations of ``kept`` (n,) landmarks, with their places among these."""
         part = self.part(kept[self.landmark])
         return part._replace(landmark=place[part.landmark])
@@ -113,8 +120,8 @@ class Estimate:
     """Unknowns of an adjustment.
 
     ``cameras`` (chasers, 9): turn (3,) and shift (3,) in IRF, share of the focal length, against
-    the calibration, and mean slide (2,) of the points that it follows, px/s. ``turns`` (m, 3): of each view against odometry, IRF. ``landmarks_m`` (n, 3),
-    TRF.
+    the calibration, and mean slide (2,) of the points that it follows, px/s. ``turns`` (m, 3): of
+    each view against odometry, IRF. ``landmarks_m`` (n, 3), TRF.
     """
 
     motion: ConstantRates

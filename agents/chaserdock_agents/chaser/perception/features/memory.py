@@ -93,7 +93,8 @@ class ViewMemory:
         rotation: Array,
         known: KnownTarget | None,
     ) -> None:
-        """Keep an image (h, w) with points ``px`` (n, 2) of ``ages_s`` (n,), unless a similar one is kept.
+        """Keep an image (h, w) with points ``px`` (n, 2) of ``ages_s`` (n,), unless a similar one
+        is kept.
 
         ``position_w_m`` (3,) and ``rotation`` (3, 3), IRF to WRF, of the camera. Without a known
         target all are kept, as far as there is room.
@@ -110,9 +111,15 @@ class ViewMemory:
         part = image[low[1] : high[1], low[0] : high[0]].copy()
         self._views.append(
             _View(
-                time_s, position_w_m, rotation, ids.copy(), px.copy(), ages_s, part,
+                time_s,
+                position_w_m,
+                rotation,
+                ids.copy(),
+                px.copy(),
+                ages_s,
+                part,
                 low.astype(float),
-            )  # fmt: skip
+            )
         )
 
     def recall(
@@ -202,6 +209,7 @@ class ViewMemory:
         )  # fmt: skip
         fits = (good.ravel() > 0) & (back_good.ravel() > 0)
         fits &= np.linalg.norm(back - start, axis=1) < tuning.return_px
+        found = np.asarray(found, dtype=np.float32)
         if not fits.any():
             return found, fits
         moved = found - predicted
@@ -211,4 +219,3 @@ class ViewMemory:
 
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 """Lucas-Kanade ends after 20 steps or at a step of 0.01 px."""
-

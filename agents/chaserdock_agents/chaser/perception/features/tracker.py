@@ -100,7 +100,7 @@ class FeatureTracker:
         self._since_s = np.zeros(0)
         self._ids = np.zeros(0, dtype=np.int64)
         self._reference_px = np.zeros((0, 2), dtype=np.float32)
-        self._px = np.zeros((0, 2), dtype=np.float32)
+        self._px: NDArray[np.float32] = np.zeros((0, 2), dtype=np.float32)
         self._step_px = np.zeros((0, 2), dtype=np.float32)
         self._birth_px = np.zeros((0, 2))
         self._birth_w = np.zeros((0, 3))
@@ -120,13 +120,15 @@ class FeatureTracker:
         """Return the points of the target in a grey image (h, w), uint8.
 
         ``position_w_m`` (3,), ``q_w_irf_wxyz`` (4,): pose of the camera by odometry. ``known``:
-        what the mapper knows, by which old points are found again. ``excluded``: discs (x, y, radius),
-        px, in which nothing is followed: other chasers and the own probe. Raises UnusableImage for
-        an image of another size or type.
+        what the mapper knows, by which old points are found again. ``excluded``: discs (x, y,
+        radius), px, in which nothing is followed: other chasers and the own probe. Raises
+        UnusableImage for an image of another size or type.
         """
         shape = (self.camera.height_px, self.camera.width_px)
         if image.dtype != np.uint8 or image.shape != shape:
-            raise UnusableImage(f"expected a uint8 image of {shape}, got {image.dtype} {image.shape}")
+            raise UnusableImage(
+                f"expected a uint8 image of {shape}, got {image.dtype} {image.shape}"
+            )
         equalized = np.asarray(self._equalize.apply(image), dtype=np.uint8)
         self._follow(equalized)
         self._drop_excluded(excluded)
@@ -138,7 +140,10 @@ class FeatureTracker:
             or self._age >= self.tuning.reference_images
             or share < self.tuning.reference_share
         ):
-            place, rotation = np.asarray(position_w_m, dtype=float), rotations.to_matrix(q_w_irf_wxyz)
+            place, rotation = (
+                np.asarray(position_w_m, dtype=float),
+                rotations.to_matrix(q_w_irf_wxyz),
+            )
             if known is not None:
                 ids, px, ages_s = self._memory.recall(equalized, time_s, place, rotation, known)
                 self._recall(ids, px, time_s - ages_s)
@@ -174,6 +179,7 @@ class FeatureTracker:
         size, border = np.array([self.camera.width_px, self.camera.height_px]), tuning.border_px
         inside = ((found > border) & (found < size - 1 - border)).all(axis=1)
         kept = (good.ravel() > 0) & (back_good.ravel() > 0) & (off < tuning.return_px) & inside
+        found = np.asarray(found, dtype=np.float32)
         self._step_px, self._px = found - self._px, found
         self._keep(kept)
         self._images += 1
@@ -240,8 +246,9 @@ class FeatureTracker:
         imaged = np.isfinite(ideal).all(axis=1)
         px, ideal, count = px[imaged], ideal[imaged], int(imaged.sum())
         rays = np.column_stack([self.camera.normalized(ideal), np.ones(count)])
+        rays_w = rotations.rotate(q_w_irf_wxyz, rays)
         self._append(
-            self._next_id + np.arange(count), px, ideal, rotations.rotate(q_w_irf_wxyz, rays), False,
+            self._next_id + np.arange(count), px, ideal, rays_w, False,
             np.full(count, time_s),
         )  # fmt: skip
         self._next_id += count

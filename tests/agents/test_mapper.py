@@ -9,18 +9,22 @@ import numpy as np
 import pytest
 from chaserdock_agents.mapper.adjustment import right_jacobian
 from chaserdock_agents.mapper.mapper import Mapper, MapperTuning, TargetMap
-from chaserdock_agents.mapper.starting import candidate_motions
+from chaserdock_agents.mapper.starting import StartTuning, candidate_motions
 from chaserdock_agents.mapper.types import ConstantRates, ImageTracks
 from chaserdock_models import rotations
 from unknown_cases import FOCAL_PX, LAB, NOISE_PX, TRUE, PointTarget
 
 WHITE = MapperTuning(noise_px=NOISE_PX)
 """For points whose errors are independent, unlike those of tracks in images."""
+FEW = StartTuning(directions=14, rates_rad_s=(0.05,), steps=10, pair_tracks=60)
+"""Fewer starts, for time."""
 
 
 def mapped(target: PointTarget, until_s: float, tuning: MapperTuning = WHITE) -> list[TargetMap]:
     """Return the maps of updates every two seconds."""
-    mapper, out, next_s = Mapper([LAB] * target.chasers, FOCAL_PX, tuning), [], 4.0
+    mapper = Mapper([LAB] * target.chasers, FOCAL_PX, tuning, FEW)
+    out: list[TargetMap] = []
+    next_s = 4.0
     for image in target.images(until_s):
         mapper.add(image)
         if image.chaser == target.chasers - 1 and image.time_s >= next_s - 1e-6:
@@ -51,6 +55,7 @@ def test_motion_is_recovered_with_a_consistent_covariance() -> None:
     assert max(shares) < 0.01
 
 
+@pytest.mark.slow(0.1)
 def test_landmarks_lie_where_the_points_are() -> None:
     found = mapped(PointTarget(3), 10.0)[-1]
     assert found.motion is not None
@@ -72,14 +77,16 @@ def test_wrong_starts_have_a_larger_cost_than_the_right_one() -> None:
     assert all(cost > 1.5 * found[0][0] for cost, _ in found[1:])
 
 
+@pytest.mark.slow(0.1)
 def test_tracks_that_no_rigid_motion_explains_give_no_map() -> None:
-    mapper, rng = Mapper([LAB] * 2, FOCAL_PX, WHITE), np.random.default_rng(0)
+    mapper, rng = Mapper([LAB] * 2, FOCAL_PX, WHITE, FEW), np.random.default_rng(0)
     drift = rng.normal(0.0, 0.012, (10000, 2))
     for image in PointTarget(2).images(9.0):
         mapper.add(replace(image, rays=image.rays + drift[image.ids] * image.time_s))
     assert {mapper.update(t).motion is None for t in (8.0, 9.0)} == {True}
 
 
+@pytest.mark.slow(0.1)
 def test_one_chaser_tells_no_scale() -> None:
     found = mapped(PointTarget(4, chasers=1), 12.0)[-1]
     assert found.status in ("scale unknown", "ambiguous")
@@ -105,6 +112,17 @@ def test_memory_is_bounded() -> None:
     assert all(views[0].time_s < 20.0 for views in mapper.kept_views())
 
 
+def test_a_view_that_shows_both_parts_of_a_landmark_counts_once() -> None:
+    mapper = Mapper([LAB] * 2, FOCAL_PX, WHITE, FEW)
+    for image in PointTarget(9, points=120).images(6.0):
+        mapper.add(image)
+    one, other = mapper.kept_views()[0][5].ids[:2].tolist()
+    mapper.merges.join(one, other)
+    _, seen, _ = mapper.observations()
+    assert len(set(zip(seen.view.tolist(), seen.landmark.tolist(), strict=True))) == len(seen.view)
+
+
+@pytest.mark.slow(0.1)
 def test_equal_tracks_give_equal_maps() -> None:
     one, other = (mapped(PointTarget(8), 8.0)[-1] for _ in range(2))
     assert np.array_equal(one.landmarks_m, other.landmarks_m)

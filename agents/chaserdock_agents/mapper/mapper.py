@@ -141,11 +141,13 @@ class Mapper:
         cameras: Sequence[CameraUncertainty],
         focal_px: float,
         tuning: MapperTuning | None = None,
+        starts: StartTuning | None = None,
     ) -> None:
+        self._starts = starts or StartTuning()
         self.tuning = tuning or MapperTuning()
         self._cameras, self._focal_px = tuple(cameras), focal_px
         self._views: list[list[ImageTracks]] = [[] for _ in cameras]
-        self._merges = Merges(MergingTuning())
+        self.merges = Merges(MergingTuning())
         self._prior: ConstantRates | None = None
         self._last: Adjusted | None = None
         self._keys = np.zeros(0, dtype=np.int64)
@@ -164,7 +166,7 @@ class Mapper:
         if self._last is None:
             return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
         ids = np.unique(np.concatenate([v.ids for v in self._views[chaser]]))
-        roots = self._merges.roots(_keys(chaser, ids))
+        roots = self.merges.roots(_keys(chaser, ids))
         at = np.minimum(np.searchsorted(self._keys, roots), len(self._keys) - 1)
         mapped = self._keys[at] == roots
         return ids[mapped], self._last.estimate.landmarks_m[at[mapped]]
@@ -191,11 +193,15 @@ class Mapper:
         """Return the views of each chaser that are kept, by time."""
         return tuple(tuple(views) for views in self._views)
 
+    def observations(self) -> tuple[Views, Observations, IntArray]:
+        """Return what the kept views show: views, observations and the keys (n,) of landmarks."""
+        return self._gathered(self._views)
+
     def describe(
         self, chaser: int, time_s: float, ids: IntArray, values: NDArray[np.uint8]
     ) -> None:
         """Take descriptions (n, 128) of tracks in an image."""
-        self._merges.add(time_s, _keys(chaser, ids), values)
+        self.merges.add(time_s, _keys(chaser, ids), values)
 
     def update(self, time_s: float) -> TargetMap:
         """Return the map from all that was added."""
@@ -214,7 +220,7 @@ class Mapper:
             return TargetMap(time_s, "gathering")
         if max(np.median([len(v.ids) for v in w]) for w in windows) < tuning.least_points:
             return TargetMap(time_s, "no texture")
-        if motion_px(windows, self._focal_px) < StartTuning().least_motion_px:
+        if motion_px(windows, self._focal_px) < self._starts.least_motion_px:
             return TargetMap(time_s, "does not turn")
         middle = [w[len(w) // 2] for w in windows]
         position = middle_of_lines(middle)
@@ -224,7 +230,9 @@ class Mapper:
             [(w[-1].position_w_m - w[0].position_w_m) / (w[-1].time_s - w[0].time_s)
              for w in windows if len(w) > 1], axis=0,
         )  # fmt: skip
-        found = candidate_motions(windows, self._focal_px, position, velocity, middle[0].time_s)
+        found = candidate_motions(
+            windows, self._focal_px, position, velocity, middle[0].time_s, self._starts
+        )
         tried = [self._tried(windows, m, ConstantRates(m.time_s, position, velocity, m.omega_rad_s))
                  for _, m in found]  # fmt: skip
         trials = sorted((t for t in tried if t is not None), key=lambda t: t[0])
@@ -235,7 +243,7 @@ class Mapper:
         size = float(np.linalg.norm(omega))
         for other in trials[1:]:
             apart = float(np.linalg.norm(other[2].estimate.motion.omega_rad_s - omega))
-            if apart > StartTuning().apart * size and other[0] < tuning.start_margin * cost:
+            if apart > self._starts.apart * size and other[0] < tuning.start_margin * cost:
                 return TargetMap(time_s, "ambiguous")
         before, self._candidate = self._candidate, (best.estimate.motion, best)
         if before is None or not self._agree(before, best):
@@ -291,7 +299,7 @@ class Mapper:
     def _extend(self, time_s: float) -> TargetMap:
         assert self._last is not None
         assert self._prior is not None
-        views, observations, keys = self._gathered(self._views)
+        views, observations, keys = self.observations()
         problem = Problem(
             views, observations, self._cameras, self._focal_px, self._prior, self.tuning.noise_px
         )
@@ -325,9 +333,9 @@ class Mapper:
             }
             problem_now = part
         self._last, self._keys = adjusted, chosen
-        self._merges.check(problem_now.observations, adjusted.residual_px, chosen)
-        self._merges.find(problem_now.observations, adjusted, chosen)
-        self._merges.forget(np.unique(observations.track))
+        self.merges.check(problem_now.observations, adjusted.residual_px, chosen)
+        self.merges.find(problem_now.observations, adjusted, chosen)
+        self.merges.forget(np.unique(observations.track))
         return self._described(time_s, adjusted, chosen)
 
     def _described(self, time_s: float, found: Adjusted, keys: IntArray) -> TargetMap:
@@ -340,7 +348,7 @@ class Mapper:
         return TargetMap(
             time_s, status, estimate.motion, found.covariance[:9, :9], estimate.cameras, keys,
             estimate.landmarks_m, found.landmark_covariances_m2, scale,
-            float(np.median(found.residual_px)), self._merges.count,
+            float(np.median(found.residual_px)), self.merges.count,
         )  # fmt: skip
 
     # -- Gathering ---------------------------------------------------------------------------------
@@ -353,7 +361,7 @@ class Mapper:
         """
         images = [v for w in windows for v in w]
         tracks = np.concatenate([_keys(v.chaser, v.ids) for v in images])
-        keys = self._merges.roots(tracks)
+        keys = self.merges.roots(tracks)
         number = np.repeat(np.arange(len(images)), [len(v.ids) for v in images])
         rays = np.concatenate([v.rays for v in images])
         views = Views(

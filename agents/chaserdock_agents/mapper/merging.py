@@ -63,6 +63,10 @@ class Merges:
             if not before or time_s - before[-1][0] > self.tuning.apart_s:
                 self._descriptions[key] = [*before, (time_s, value)][-self.tuning.kept :]
 
+    def join(self, root: int, key: int) -> None:
+        """Let one track stand for another one."""
+        self._parent[key] = root
+
     def roots(self, keys: IntArray) -> IntArray:
         """Return the keys (n,) of the landmarks of tracks (n,)."""
         if not self._parent:
@@ -100,7 +104,7 @@ class Merges:
                 continue
             used |= {a, b}
             for key in (b, *members.get(b, [])):
-                self._parent[key] = a
+                self.join(a, key)
             made += 1
         return made
 

@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A target of unknown shape: map and motion from what two chasers see.
+
+``python benchmarks/unknown.py [--mesh NAME] [--sun X Y Z] [--rate-deg-s RATE] [--flights N]``
+"""
+
+from common import main
+from parts import unknown_map
+
+GROUPS = (unknown_map.GROUP,)
+
+if __name__ == "__main__":
+    main(__doc__, GROUPS)

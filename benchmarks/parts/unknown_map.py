@@ -209,7 +209,8 @@ def pose_errors(images: UnknownImages, times_s: Array, motions: list[ConstantRat
     rows = np.concatenate([r, -np.repeat(np.eye(3)[None], len(r), axis=0)], axis=2)
     # Along the axis of rotation the two are one: it counts as the place of the origin.
     rows = np.concatenate([rows.reshape(-1, 6), np.eye(6)[3:]])
-    solved = np.linalg.lstsq(rows, np.append((true_p - p).ravel(), np.zeros(3)), rcond=None)[0]
+    seen = np.append((true_p - p).ravel(), np.zeros(3))
+    solved: Array = np.asarray(np.linalg.lstsq(rows, seen, rcond=None)[0], dtype=np.float64)
     origin, offset = solved[:3], solved[3:]
     varies = p + r @ origin - true_p - offset
     left = r @ turn @ (tilt @ true_r).transpose(0, 2, 1)

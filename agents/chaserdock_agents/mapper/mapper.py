@@ -431,6 +431,7 @@ class Mapper:
 
 
 _SLACK_S = 1e-6
+"""Difference of two times, s, that are the same but for rounding."""
 _ASSUMED_M = 2.0
 """Range from which a single camera starts: it cannot tell."""
 _START_ROUNDS, _ROUNDS = 3, 1

@@ -135,7 +135,7 @@ def test_overrides_apply_in_order_and_leave_the_rest(file: Path) -> None:
         ("seed=", "--set seed=: seed: must be a whole number at least 0 and less than 4294967296"),
         ("seed=x", "--set seed=x: seed: must be a whole number"),
         ("duration_s=nan", "--set duration_s=nan: duration_s: must be a finite number (got nan)"),
-        ("chasers=4", "--set chasers=4: chasers: must be an array of 1 to 16 tables (got 4)"),
+        ("chasers=4", "--set chasers=4: chasers: must be an array of 1 to 64 tables (got 4)"),
         ("target=paper", "--set target=paper: target: must be a table"),
     ],
 )

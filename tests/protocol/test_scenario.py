@@ -241,7 +241,7 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("controller.falloff", 1.5, "controller.falloff", "a number from 0 to 1 (got 1.5)"),
     ("controller.weight_force", 0.0, "controller.weight_force", "greater than 0"),
     ("approach.max_speed_m_s", 0.0, "approach.max_speed_m_s", "greater than 0"),
-    ("chasers", [], "chasers", "an array of 1 to 16 tables (got [])"),
+    ("chasers", [], "chasers", "an array of 1 to 64 tables (got [])"),
     ("chasers", 4, "chasers", "must be an array of 1 to 64 tables (got 4)"),
     ("target", "paper", "target", "must be a table"),
     ("seed", -1, "seed", "at least 0"),

@@ -37,7 +37,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.satellites import satellite, satellite_names
 from common import Figures, Group, KeptResults, Options, seeds_of
 
-from .unknown_scene import Case, UnknownImages
+from .unknown_scene import SceneCase, UnknownImages
 
 UPDATE_S = 6.0
 """Between updates of a map: 0.3 to 0.6 of a core (docs/evidence/unknown.md)."""
@@ -83,7 +83,7 @@ def uncertainty(images: UnknownImages) -> CameraUncertainty:
     )
 
 
-def fly(case: Case, folder: Path) -> MapOutcome:
+def fly(case: SceneCase, folder: Path) -> MapOutcome:
     """Return the figures of a sequence of two turns."""
     images = UnknownImages(case, folder)
     camera, chasers = images.camera, len(case.places_m)
@@ -160,7 +160,7 @@ def fly(case: Case, folder: Path) -> MapOutcome:
     )
 
 
-def rate_share(case: Case, found: TargetMap) -> float:
+def rate_share(case: SceneCase, found: TargetMap) -> float:
     """Return the error of the rate vector as a share of its length. Its direction in WRF is that in
     TRF, as the rates are constant and the target starts with the axes of WRF.
     """
@@ -169,7 +169,7 @@ def rate_share(case: Case, found: TargetMap) -> float:
     return float(np.linalg.norm(found.motion.omega_rad_s - true) / np.linalg.norm(true))
 
 
-def rate_nees(case: Case, found: TargetMap) -> float:
+def rate_nees(case: SceneCase, found: TargetMap) -> float:
     """Return the squared error of velocity and rate (6) by their covariance."""
     assert found.motion is not None
     error = found.motion.vector()[3:] - np.array([*case.velocity_m_s, *case.omega_rad_s])
@@ -177,7 +177,7 @@ def rate_nees(case: Case, found: TargetMap) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseErrors:
+class MapPoseErrors:
     """Errors of poses in the frame of the map.
 
     ``offset_m``, ``offset_rad``: constant error in WRF, which the cameras' unknown mounting makes,
@@ -194,7 +194,9 @@ class PoseErrors:
     origin_m: Array
 
 
-def pose_errors(images: UnknownImages, times_s: Array, motions: list[ConstantRates]) -> PoseErrors:
+def pose_errors(
+    images: UnknownImages, times_s: Array, motions: list[ConstantRates]
+) -> MapPoseErrors:
     """Return the errors of the poses by ``motions`` at times (n,)."""
     found = [motion.at([at_s]) for motion, at_s in zip(motions, times_s, strict=True)]
     p, r = np.array([f[0][0] for f in found]), np.array([f[1][0] for f in found])
@@ -214,7 +216,7 @@ def pose_errors(images: UnknownImages, times_s: Array, motions: list[ConstantRat
     origin, offset = solved[:3], solved[3:]
     varies = p + r @ origin - true_p - offset
     left = r @ turn @ (tilt @ true_r).transpose(0, 2, 1)
-    return PoseErrors(
+    return MapPoseErrors(
         float(np.linalg.norm(offset)),
         _angle(tilt),
         float(np.sqrt((varies**2).sum(axis=1).mean())),
@@ -276,12 +278,12 @@ _CHUNK = 50
 
 def measure(options: Options) -> Figures:
     """Measure map and motion of each seed."""
-    omega = np.array(Case().omega_rad_s)
+    omega = np.array(SceneCase().omega_rad_s)
     if options.rate_deg_s is not None:
         omega *= np.deg2rad(options.rate_deg_s) / np.linalg.norm(omega)
     x, y, z = omega.tolist()
     sx, sy, sz = options.sun
-    case = Case(mesh=options.mesh, to_sun=(sx, sy, sz), omega_rad_s=(x, y, z))
+    case = SceneCase(mesh=options.mesh, to_sun=(sx, sy, sz), omega_rad_s=(x, y, z))
     case = replace(
         case, duration_s=float(np.ceil((1.0 if options.quick else 2.0) * case.turn_s)) + 8
     )
@@ -317,14 +319,14 @@ def measure(options: Options) -> Figures:
 _FIELDS = tuple(MapOutcome.__dataclass_fields__)
 
 
-def _flown(case: Case, folder: Path, seed: int) -> MapOutcome:
+def _flown(case: SceneCase, folder: Path, seed: int) -> MapOutcome:
     return fly(replace(case, seed=seed), folder)
 
 
 def _add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--mesh", choices=satellite_names(), default="geo_servicer")
     parser.add_argument(
-        "--sun", nargs=3, type=float, metavar=("X", "Y", "Z"), default=Case().to_sun,
+        "--sun", nargs=3, type=float, metavar=("X", "Y", "Z"), default=SceneCase().to_sun,
         help="direction to the sun, WRF",
     )  # fmt: skip
     parser.add_argument("--rate-deg-s", type=float, metavar="RATE", help="tumble (default: 3.2)")

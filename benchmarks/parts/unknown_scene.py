@@ -30,7 +30,7 @@ TICKS_PER_IMAGE = 6
 
 
 @dataclass(frozen=True)
-class Case:
+class SceneCase:
     """One sequence.
 
     ``mesh``: a shipped satellite. ``places_m``: of the chasers from the target's centre, WRF.
@@ -93,7 +93,7 @@ class Exposure:
 class UnknownImages:
     """The images of a case in the order of time; rendered where ``folder`` does not keep them."""
 
-    def __init__(self, case: Case, folder: Path) -> None:
+    def __init__(self, case: SceneCase, folder: Path) -> None:
         self.case, self.scenario = case, case.scenario()
         key = {k: v for k, v in asdict(case).items() if k != "duration_s"}
         name = hashlib.sha256(repr(sorted(key.items())).encode()).hexdigest()[:12]

@@ -17,7 +17,7 @@ from chaserdock_models.arrays import Array, IntArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
-from .types import CameraUncertainty, ConstantRates, Estimate, Observations, Views
+from .types import CameraUncertainty, CameraViews, ConstantRates, MapEstimate, Observations
 
 MOTION, CAMERA, TURN = 9, 9, 3
 """Numbers of unknowns of the motion, of a chaser's camera and of a view."""
@@ -52,7 +52,7 @@ class Problem:
     observations.
     """
 
-    views: Views
+    views: CameraViews
     observations: Observations
     cameras: Sequence[CameraUncertainty]
     focal_px: float
@@ -71,7 +71,7 @@ class Adjusted:
     gained next to nothing.
     """
 
-    estimate: Estimate
+    estimate: MapEstimate
     residual_px: Array
     covariance: Array
     landmark_covariances_m2: Array
@@ -108,7 +108,7 @@ def right_jacobian(phi: Array) -> Array:
 
 
 def in_cameras(
-    problem: Problem, estimate: Estimate, observations: Observations | None = None
+    problem: Problem, estimate: MapEstimate, observations: Observations | None = None
 ) -> Array:
     """Return the landmarks of observations (k, 3) in IRF."""
     seen = problem.observations if observations is None else observations
@@ -125,13 +125,13 @@ def in_cameras(
     return (matrix[seen.view] @ points[:, :, None])[:, :, 0] + offset[seen.view]
 
 
-def residuals(problem: Problem, estimate: Estimate) -> Array:
+def residuals(problem: Problem, estimate: MapEstimate) -> Array:
     """Return weighted residuals (k, 2), px; large ones for landmarks behind a camera."""
     y = in_cameras(problem, estimate)
     return _residuals(problem, estimate, y)
 
 
-def _residuals(problem: Problem, estimate: Estimate, y: Array) -> Array:
+def _residuals(problem: Problem, estimate: MapEstimate, y: Array) -> Array:
     depth = np.maximum(y[:, 2:], _LEAST_DEPTH_M)
     seen = problem.observations
     error = estimate.cameras[problem.views.chaser[seen.view]]
@@ -143,7 +143,7 @@ _LEAST_DEPTH_M = 0.02
 """Depth below which a landmark counts as behind a camera."""
 
 
-def _linearize(problem: Problem, estimate: Estimate) -> _Linearized:
+def _linearize(problem: Problem, estimate: MapEstimate) -> _Linearized:
     views, seen, motion = problem.views, problem.observations, estimate.motion
     _, turned = motion.at(views.time_s)
     error = estimate.cameras[views.chaser]
@@ -177,7 +177,7 @@ def _linearize(problem: Problem, estimate: Estimate) -> _Linearized:
 class _Normal:
     """Normal equations: of motion, cameras and views, with landmarks eliminated."""
 
-    def __init__(self, problem: Problem, estimate: Estimate, weights: Array) -> None:
+    def __init__(self, problem: Problem, estimate: MapEstimate, weights: Array) -> None:
         lin, seen, views = _linearize(problem, estimate), problem.observations, problem.views
         count, landmarks = len(views.time_s), len(estimate.landmarks_m)
         chasers = len(problem.cameras)
@@ -307,10 +307,10 @@ _USUAL_RANGE_M = 1.8
 """Range of an inspection: 0.5 mm are 0.016 degrees there."""
 
 
-def _moved(estimate: Estimate, problem: Problem, first: Array, landmarks: Array) -> Estimate:
+def _moved(estimate: MapEstimate, problem: Problem, first: Array, landmarks: Array) -> MapEstimate:
     chasers = len(problem.cameras)
     end = MOTION + CAMERA * chasers
-    return Estimate(
+    return MapEstimate(
         estimate.motion.moved(first[:MOTION]),
         estimate.cameras + first[MOTION:end].reshape(chasers, CAMERA),
         estimate.turns + first[end:].reshape(-1, TURN),
@@ -323,7 +323,7 @@ def robust_cost(residual: Array, robust_px: float) -> Array:
     return robust_px**2 * np.log1p((residual**2).sum(axis=1) / robust_px**2)
 
 
-def _total(problem: Problem, estimate: Estimate, robust_px: float) -> float:
+def _total(problem: Problem, estimate: MapEstimate, robust_px: float) -> float:
     seen = robust_cost(residuals(problem, estimate), robust_px).sum() / problem.noise_px**2
     off = np.concatenate(
         [
@@ -337,7 +337,7 @@ def _total(problem: Problem, estimate: Estimate, robust_px: float) -> float:
 
 
 def adjust(
-    problem: Problem, start: Estimate, tuning: AdjustmentTuning | None = None
+    problem: Problem, start: MapEstimate, tuning: AdjustmentTuning | None = None
 ) -> Adjusted | None:
     """Return the estimate of least robust cost near ``start``; None if it is not determined."""
     tuning = tuning or AdjustmentTuning()
@@ -372,7 +372,7 @@ _TRIES = 6
 
 
 def _described(
-    problem: Problem, estimate: Estimate, tuning: AdjustmentTuning, converged: bool
+    problem: Problem, estimate: MapEstimate, tuning: AdjustmentTuning, converged: bool
 ) -> Adjusted:
     residual = residuals(problem, estimate)
     squared = (residual**2).sum(axis=1)
@@ -405,7 +405,7 @@ def _described(
     )
 
 
-def triangulate(problem: Problem, estimate: Estimate, count: int) -> tuple[Array, Array]:
+def triangulate(problem: Problem, estimate: MapEstimate, count: int) -> tuple[Array, Array]:
     """Return ``count`` landmarks (n, 3), TRF, where the lines of sight meet, and the standard
     deviation (n,), m, of each along its worst direction; infinite where it cannot be told.
 
@@ -457,6 +457,6 @@ _TRIANGULATIONS, _TRIANGULATION_PX = 4, 2.0
 accurate yet."""
 
 
-def with_landmarks(estimate: Estimate, landmarks_m: Array) -> Estimate:
+def with_landmarks(estimate: MapEstimate, landmarks_m: Array) -> MapEstimate:
     """Return the estimate with other landmarks."""
     return replace(estimate, landmarks_m=landmarks_m)

@@ -30,11 +30,11 @@ from .merging import Merges, MergingTuning, medians
 from .starting import StartTuning, candidate_motions, middle_of_lines, motion_px
 from .types import (
     CameraUncertainty,
+    CameraViews,
     ConstantRates,
-    Estimate,
     ImageTracks,
+    MapEstimate,
     Observations,
-    Views,
 )
 
 Status = Literal[
@@ -112,7 +112,7 @@ class TargetMap:
     """What is known at ``time_s``.
 
     ``motion`` and what follows are None, empty or infinite without a map. ``covariance`` (9, 9): of
-    the motion's vector. ``cameras`` (chasers, 9): see `Estimate`. ``keys`` (n,): of landmarks,
+    the motion's vector. ``cameras`` (chasers, 9): see `MapEstimate`. ``keys`` (n,): of landmarks,
     ``landmarks_m`` (n, 3), TRF, ``covariances_m2`` (n, 3, 3). ``scale_share``: standard deviation
     of all distances.
     """
@@ -193,7 +193,7 @@ class Mapper:
         """Return the views of each chaser that are kept, by time."""
         return tuple(tuple(views) for views in self._views)
 
-    def observations(self) -> tuple[Views, Observations, IntArray]:
+    def observations(self) -> tuple[CameraViews, Observations, IntArray]:
         """Return what the kept views show: views, observations and the keys (n,) of landmarks."""
         return self._gathered(self._views)
 
@@ -271,7 +271,7 @@ class Mapper:
         problem = Problem(
             views, observations, self._cameras, self._focal_px, prior, self.tuning.noise_px
         )
-        estimate = Estimate(
+        estimate = MapEstimate(
             motion, np.zeros((len(self._cameras), CAMERA)), np.zeros((len(views.time_s), 3)),
             np.zeros((0, 3)),
         )  # fmt: skip
@@ -310,7 +310,7 @@ class Mapper:
                 self._turns.get((c, t), np.zeros(3))
                 for c, t in zip(views.chaser.tolist(), views.time_s.tolist(), strict=True)
             ]
-            start = Estimate(last.motion, last.cameras, np.array(turns), last.landmarks_m)
+            start = MapEstimate(last.motion, last.cameras, np.array(turns), last.landmarks_m)
             part, start, selected = self._selected(
                 problem, start, keys, self.tuning.first_residual_px, chosen
             )
@@ -355,7 +355,7 @@ class Mapper:
 
     def _gathered(
         self, windows: Sequence[Sequence[ImageTracks]]
-    ) -> tuple[Views, Observations, IntArray]:
+    ) -> tuple[CameraViews, Observations, IntArray]:
         """Return views, observations and the keys (n,) of the landmarks, of tracks that enough
         views show.
         """
@@ -364,7 +364,7 @@ class Mapper:
         keys = self.merges.roots(tracks)
         number = np.repeat(np.arange(len(images)), [len(v.ids) for v in images])
         rays = np.concatenate([v.rays for v in images])
-        views = Views(
+        views = CameraViews(
             np.array([v.chaser for v in images]),
             np.array([v.time_s for v in images]),
             np.array([v.position_w_m for v in images]),
@@ -393,11 +393,11 @@ class Mapper:
     def _selected(
         self,
         problem: Problem,
-        estimate: Estimate,
+        estimate: MapEstimate,
         keys: IntArray,
         limit_px: float,
         known: IntArray | None = None,
-    ) -> tuple[Problem | None, Estimate, IntArray]:
+    ) -> tuple[Problem | None, MapEstimate, IntArray]:
         """Return the problem and start of the landmarks that fit the estimate, and their keys; None
         if these are too few.
 

@@ -74,7 +74,7 @@ class ConstantRates:
         return ConstantRates(self.time_s, p, v, w)
 
 
-class Views(NamedTuple):
+class CameraViews(NamedTuple):
     """The m images of an adjustment: chaser (m,), time (m,), optical centre (m, 3), rotation
     (m, 3, 3), IRF to WRF.
     """
@@ -116,7 +116,7 @@ class Observations(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class MapEstimate:
     """Unknowns of an adjustment.
 
     ``cameras`` (chasers, 9): turn (3,) and shift (3,) in IRF, share of the focal length, against

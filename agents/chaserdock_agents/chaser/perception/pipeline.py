@@ -69,6 +69,9 @@ _FAR_MOVE_PX, _SETTLED_MOVE_PX = 1.0, 0.3
 """Corrections, px, of the corners that a prediction gives: above the first the fit is repeated from
 its result, and above the second that repetition is not trusted. A single fit from further away
 takes an inner cell's edge for a side in 1 of 100 images; one that is repeated never did."""
+_LEAST_SIDE_PX = 14.0
+"""Side, px, of markers that are read where a prediction puts them: two a cell. A search finds those
+as well: a prediction saves time, and does not extend the range."""
 _NO_COARSE = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2)), CornerErrors.even(np.zeros(0))
 _NO_FURTHER = FurtherMarkers(*_NO_COARSE, range(0))
 
@@ -212,6 +215,8 @@ class Perception:
         pose = PoseInCamera(position, rotations.to_matrix(q))
         read = self.reader.read(image, self.camera, pose, _NO_COARSE[0])
         rows, px = read.rows, read.corners_px[read.rows]
+        large = corners.mean_side_px(px) >= _LEAST_SIDE_PX
+        rows, px = rows[large], px[large]
         refined = self.refined(image, px, rows)
         far = refined.good & (_largest_move_px(refined, px) > _FAR_MOVE_PX)
         if far.any():

@@ -110,12 +110,17 @@ class _Evidence:
     def marginal(self, total: Array) -> tuple[float, Array, Array]:
         """Return energy r'r, f'r (n,) and f'f (n,) after integration over the mismatch.
 
-        It gives the residuals the inverse covariance I - m (I + m'm)^-1 m'.
+        It gives the residuals the inverse covariance I - m (I + m'm)^-1 m'. Zeros where rounding
+        has left nothing of it, as with speeds that no chaser has.
         """
         n = self._n
         parts = total[1 + 2 * n :].reshape(self._shape)
         information = parts[:, 1 + n :] + np.eye(len(parts))
-        white = np.linalg.solve(np.linalg.cholesky(information), parts[:, : 1 + n])
+        try:
+            factor = np.linalg.cholesky(information)
+        except np.linalg.LinAlgError:
+            return 0.0, np.zeros(n), np.zeros(n)
+        white = np.linalg.solve(factor, parts[:, : 1 + n])
         energy = float(total[0] - white[:, 0] @ white[:, 0])
         along = total[1 : 1 + n] - white[:, 1:].T @ white[:, 0]
         squared = total[1 + n : 1 + 2 * n] - (white[:, 1:] ** 2).sum(axis=0)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from .description import PointDescriptions, describe
-from .memory import KnownTarget, TargetMotion
+from .memory import KnownTarget, SupposedMotion
 from .tracker import BYTES_PER_POINT, FeatureTracker, TrackedPoints, TrackingTuning
 
 __all__ = [
@@ -12,7 +12,7 @@ __all__ = [
     "FeatureTracker",
     "KnownTarget",
     "PointDescriptions",
-    "TargetMotion",
+    "SupposedMotion",
     "TrackedPoints",
     "TrackingTuning",
     "describe",

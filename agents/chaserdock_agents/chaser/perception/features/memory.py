@@ -19,7 +19,7 @@ from chaserdock_models.camera import Camera
 from numpy.typing import ArrayLike, NDArray
 
 
-class TargetMotion(Protocol):
+class SupposedMotion(Protocol):
     """Where a target is: see `at`."""
 
     def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
@@ -33,7 +33,7 @@ class KnownTarget:
     chaser's points ``ids`` (n,), ascending.
     """
 
-    motion: TargetMotion
+    motion: SupposedMotion
     ids: IntArray
     landmarks_m: Array
 

@@ -9,7 +9,7 @@ since: this closes the loop.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import cv2
@@ -17,6 +17,8 @@ import numpy as np
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.camera import Camera
 from numpy.typing import ArrayLike, NDArray
+
+from .flow import FlowTuning, followed
 
 
 class SupposedMotion(Protocol):
@@ -52,10 +54,7 @@ class MemoryTuning:
     """Views that are younger tell nothing that tracking does not."""
     least_points: int = 15
     """Points that must be found again together; fewer may be wrong alike."""
-    window_px: int = 21
-    levels: int = 2
-    return_px: float = 0.4
-    """As in the tracker."""
+    flow: FlowTuning = field(default_factory=FlowTuning)
     astray_px: float = 3.0
     """Distance from the common displacement of all points beyond which one is wrong: less than half
     a cell of a solar panel at 2 m."""
@@ -196,26 +195,15 @@ class ViewMemory:
         shifted = matrix.copy()
         shifted[:, 2] += matrix[:, :2] @ view.corner_px
         height, width = image.shape
-        warped = cv2.warpAffine(view.image, shifted, (width, height), flags=cv2.INTER_LINEAR)
+        warped = np.asarray(
+            cv2.warpAffine(view.image, shifted, (width, height), flags=cv2.INTER_LINEAR),
+            dtype=np.uint8,
+        )
         start = (px @ matrix[:, :2].T + matrix[:, 2]).astype(np.float32)
-        window = (tuning.window_px, tuning.window_px)
-        found, good, _ = cv2.calcOpticalFlowPyrLK(
-            warped, image, start, predicted.astype(np.float32), winSize=window,
-            maxLevel=tuning.levels, criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )  # fmt: skip
-        back, back_good, _ = cv2.calcOpticalFlowPyrLK(
-            image, warped, found, start.copy(), winSize=window, maxLevel=0, criteria=_CRITERIA,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )  # fmt: skip
-        fits = (good.ravel() > 0) & (back_good.ravel() > 0)
-        fits &= np.linalg.norm(back - start, axis=1) < tuning.return_px
-        found = np.asarray(found, dtype=np.float32)
+        guess = predicted.astype(np.float32)
+        found, fits = followed(warped, image, start, guess, tuning.flow)
         if not fits.any():
             return found, fits
         moved = found - predicted
         fits &= np.linalg.norm(moved - np.median(moved[fits], axis=0), axis=1) < tuning.astray_px
         return found, fits
-
-
-_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
-"""Lucas-Kanade ends after 20 steps or at a step of 0.01 px."""

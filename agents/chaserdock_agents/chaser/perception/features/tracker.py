@@ -10,7 +10,7 @@ image: stars, the Earth and the chaser's own probe never do.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_protocol.pose_image import UnusableImage
 from numpy.typing import ArrayLike, NDArray
 
+from .flow import FlowTuning, followed
 from .memory import KnownTarget, ViewMemory
 
 BYTES_PER_POINT = 9
@@ -39,13 +40,7 @@ class TrackingTuning:
     least_contrast: float = 0.012
     """Smaller eigenvalue of a corner as a share of the image's largest: noise of flat surfaces has
     a tenth of that."""
-    window_px: int = 21
-    """Side of the window that is followed: smaller ones slide along the grid of solar cells, larger
-    ones mix surfaces of different depth."""
-    levels: int = 2
-    """Halvings of the image: catch 40 px from reference to image."""
-    return_px: float = 0.4
-    """Forward and back must end so close to the start: four standard deviations of good points."""
+    flow: FlowTuning = field(default_factory=FlowTuning)
     reference_images: int = 6
     """Images after which a new reference is taken: 1.2 s at five a second, 4 degrees of turn."""
     reference_share: float = 0.75
@@ -165,23 +160,12 @@ class FeatureTracker:
         if self._reference is None or not len(self._ids):
             return
         tuning = self.tuning
-        window, criteria = (tuning.window_px, tuning.window_px), _CRITERIA
         guess = self._px + self._step_px
-        found, good, _ = cv2.calcOpticalFlowPyrLK(
-            self._reference, image, self._reference_px, guess.copy(), winSize=window,
-            maxLevel=tuning.levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )  # fmt: skip
-        back, back_good, _ = cv2.calcOpticalFlowPyrLK(
-            image, self._reference, found, self._reference_px.copy(), winSize=window,
-            maxLevel=0, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )  # fmt: skip
-        off = np.linalg.norm(back - self._reference_px, axis=1)
+        found, good = followed(self._reference, image, self._reference_px, guess, tuning.flow)
         size, border = np.array([self.camera.width_px, self.camera.height_px]), tuning.border_px
         inside = ((found > border) & (found < size - 1 - border)).all(axis=1)
-        kept = (good.ravel() > 0) & (back_good.ravel() > 0) & (off < tuning.return_px) & inside
-        found = np.asarray(found, dtype=np.float32)
         self._step_px, self._px = found - self._px, found
-        self._keep(kept)
+        self._keep(good & inside)
         self._images += 1
 
     def _keep(self, kept: NDArray[np.bool_] | IntArray) -> None:
@@ -318,8 +302,6 @@ class FeatureTracker:
         return left, top, right, bottom
 
 
-_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
-"""Lucas-Kanade ends after 20 steps or at a step of 0.01 px, a tenth of its error."""
 _COLUMNS = (
     "_ids", "_reference_px", "_px", "_step_px", "_birth_px", "_birth_w", "_images", "_moves",
     "_since_s",

@@ -28,6 +28,7 @@ from concurrent.futures import (
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any, BinaryIO, Generic, TypeVar
 
 import msgspec
@@ -120,18 +121,13 @@ def spread(
         active: dict[Future[bytes], T] = {}
         while True:
             room = pool.room() - len(active)
-            for item in () if stop() else _first(waiting, room):
+            for item in () if stop() else islice(waiting, max(room, 0)):
                 call = msgspec.json.encode(item)
                 active[pool.submit(task.module, call, expected)] = item
             if not active:
                 return
             for future in wait(active, _SETTINGS.look_s, FIRST_COMPLETED).done:
                 yield active.pop(future), _opened(pool.answer(future), task, places)
-
-
-def _first(items: Iterator[T], number: int) -> Iterator[T]:
-    for _, item in zip(range(number), items, strict=False):
-        yield item
 
 
 def _opened(line: bytes, task: ServedCall[Any, R], places: Places) -> R | Lost:

@@ -34,22 +34,15 @@ class AdjustmentTuning:
     its standard deviation."""
     robust_px: float = 0.6
     """Residual with half weight: twice that of a good track."""
-    position_prior_m: float = 0.5
-    """Standard deviation of the first guess of the target's position: the cameras' lines of sight
-    to the middle of the moving points."""
-    velocity_prior_m_s: float = 0.1
-    """Standard deviation of the target's velocity against that of the chasers that hold beside
-    it."""
     damping: float = 1e-4
     """First damping, share of the diagonal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What an adjustment starts from. ``focal_px``: of all cameras. ``prior``: motion with the
-    standard deviations of ``AdjustmentTuning``; along its axis of rotation it says where the origin
-    of TRF is. ``noise_px``: of a coordinate, for independent
-    observations.
+    """What an adjustment starts from. ``focal_px``: of all cameras. ``prior``: of the motion; along
+    its axis of rotation it says where the origin of TRF is. ``noise_px``: of a coordinate, for
+    independent observations.
     """
 
     views: CameraViews
@@ -92,10 +85,6 @@ class _Linearized:
     by_landmark: Array
 
 
-def _skew(v: Array) -> Array:
-    return rotations.skew(v)
-
-
 def right_jacobian(phi: Array) -> Array:
     """Return the right Jacobian (n, 3, 3) of rotation vectors (n, 3) (Sola eq. 143)."""
     angle = np.linalg.norm(phi, axis=1)[:, None, None]
@@ -103,7 +92,7 @@ def right_jacobian(phi: Array) -> Array:
     safe = np.where(small, 1.0, angle)
     a = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
     b = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    s = _skew(phi)
+    s = rotations.skew(phi)
     return np.eye(3) - a * s + b * (s @ s)
 
 
@@ -161,8 +150,8 @@ def _linearize(problem: Problem, estimate: MapEstimate) -> _Linearized:
     by_landmark = by_w @ turned[seen.view]
     jr = right_jacobian(motion.omega_rad_s * after[:, None]) * after[:, None, None]
     points = estimate.landmarks_m[seen.landmark]
-    by_rate = -by_landmark @ _skew(points) @ jr[seen.view]
-    by_turn = by_y @ _skew(y)
+    by_rate = -by_landmark @ rotations.skew(points) @ jr[seen.view]
+    by_turn = by_y @ rotations.skew(y)
     out = np.empty((len(y), 2, MOTION + CAMERA + TURN))
     out[:, :, 0:3] = by_w
     out[:, :, 3:6] = by_w * after[seen.view, None, None]
@@ -195,10 +184,7 @@ class _Normal:
             at = self._places(views.chaser[view], view, first_turn)
             u[np.ix_(at, at)] += block.T @ block
             g[at] += block.T @ r[rows].ravel()
-        gather = sparse.csr_matrix(
-            (np.ones(len(seen.view)), (seen.landmark, np.arange(len(seen.view)))),
-            shape=(landmarks, len(seen.view)),
-        )
+        gather = _by_landmark(seen, landmarks)
         cross = a.transpose(0, 2, 1) @ b
         w = np.zeros((size, landmarks, 3))
         w[:MOTION] = _gathered(gather, cross[:, :MOTION]).transpose(1, 0, 2)
@@ -212,13 +198,7 @@ class _Normal:
         self.v = _gathered(gather, b.transpose(0, 2, 1) @ b)
         self.h = _gathered(gather, b.transpose(0, 2, 1) @ r[:, :, None])[:, :, 0]
         sigma = _prior_sigmas(problem)
-        off = np.concatenate(
-            [
-                estimate.motion.vector() - problem.prior.vector(),
-                estimate.cameras.ravel(),
-                estimate.turns.ravel(),
-            ]
-        )
+        off = _off_prior(problem, estimate)
         u[np.diag_indices(size)] += 1.0 / sigma**2
         g += off / sigma**2
         axis = _gauge(problem)
@@ -260,15 +240,26 @@ _FLOOR = 1e-3
 """Information, 1/m^2, that keeps a landmark seen along one line solvable: 30 m."""
 
 
+def _by_landmark(seen: Observations, count: int) -> sparse.csr_matrix:
+    """Return the matrix (n, k) that sums what observations have by landmark."""
+    every = np.arange(len(seen.view))
+    return sparse.csr_matrix((np.ones(len(every)), (seen.landmark, every)), (count, len(every)))
+
+
 def _gathered(gather: sparse.csr_matrix, values: Array) -> Array:
     """Return the sums (n, ...) of values (k, ...) by landmark."""
     flat = gather @ values.reshape(len(values), -1)
     return np.asarray(flat).reshape(-1, *values.shape[1:])
 
 
+def _off_prior(problem: Problem, estimate: MapEstimate) -> Array:
+    """Return motion, cameras and turns (a,) less what is expected of them."""
+    motion = estimate.motion.vector() - problem.prior.vector()
+    return np.concatenate([motion, estimate.cameras.ravel(), estimate.turns.ravel()])
+
+
 def _prior_sigmas(problem: Problem) -> Array:
-    tuning = AdjustmentTuning()
-    motion = np.repeat([tuning.position_prior_m, tuning.velocity_prior_m_s, _RATE_PRIOR_RAD_S], 3)
+    motion = np.repeat([_POSITION_PRIOR_M, _VELOCITY_PRIOR_M_S, _RATE_PRIOR_RAD_S], 3)
     cameras = [
         np.array([*[c.turn_rad] * 3, *[c.shift_m] * 3, c.focal_share, *[_SLIDE_PX_S] * 2])
         for c in problem.cameras
@@ -299,6 +290,11 @@ def view_turn_sigma_rad(camera: CameraUncertainty) -> float:
 
 _SLIDE_PX_S = 0.1
 """Standard deviation of the mean slide of a camera's points: shading follows the light."""
+_POSITION_PRIOR_M = 0.5
+"""Standard deviation of the first guess of the target's position: the cameras' lines of sight to
+the middle of the moving points."""
+_VELOCITY_PRIOR_M_S = 0.1
+"""Standard deviation of the target's velocity against that of the chasers that hold beside it."""
 _RATE_PRIOR_RAD_S = 1.0
 """Standard deviation of the rate: no knowledge."""
 _LEAST_SIGMA = 1e-7
@@ -325,13 +321,7 @@ def robust_cost(residual: Array, robust_px: float) -> Array:
 
 def _total(problem: Problem, estimate: MapEstimate, robust_px: float) -> float:
     seen = robust_cost(residuals(problem, estimate), robust_px).sum() / problem.noise_px**2
-    off = np.concatenate(
-        [
-            estimate.motion.vector() - problem.prior.vector(),
-            estimate.cameras.ravel(),
-            estimate.turns.ravel(),
-        ]
-    )
+    off = _off_prior(problem, estimate)
     prior = ((off / _prior_sigmas(problem)) ** 2).sum() + (_gauge(problem) @ off[:3]) ** 2
     return float(seen + prior)
 
@@ -423,10 +413,7 @@ def triangulate(problem: Problem, estimate: MapEstimate, count: int) -> tuple[Ar
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     direction = np.einsum("kij,kj->ki", (back @ true)[seen.view], rays)
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    gather = sparse.csr_matrix(
-        (np.ones(len(seen.view)), (seen.landmark, np.arange(len(seen.view)))),
-        shape=(count, len(seen.view)),
-    )
+    gather = _by_landmark(seen, count)
     from_centre = np.einsum("kij,kj->ki", across, centre[seen.view])
     points: Array = np.zeros((count, 3))
     weight = seen.weight**2

@@ -286,9 +286,7 @@ class Mapper:
             estimate, limit = adjusted.estimate, self.tuning.residual_px
         every, _ = triangulate(problem, estimate, len(keys))
         whole = with_landmarks(estimate, every)
-        off = np.linalg.norm(residuals(problem, whole), axis=1)
-        off[in_cameras(problem, whole)[:, 2] < _BEHIND_M] = _CAP_PX
-        off = np.minimum(off, _CAP_PX)
+        off = np.minimum(_off_px(problem, whole), _CAP_PX)
         median = medians(off, observations.landmark, len(keys))
         share = float((median < self.tuning.residual_px).mean())
         assert adjusted is not None
@@ -303,38 +301,27 @@ class Mapper:
         problem = Problem(
             views, observations, self._cameras, self._focal_px, self._prior, self.tuning.noise_px
         )
-        adjusted, chosen, problem_now = self._last, self._keys, problem
-        for _ in range(_ROUNDS):
-            last = adjusted.estimate
-            turns = [
-                self._turns.get((c, t), np.zeros(3))
-                for c, t in zip(views.chaser.tolist(), views.time_s.tolist(), strict=True)
-            ]
-            start = MapEstimate(last.motion, last.cameras, np.array(turns), last.landmarks_m)
-            part, start, selected = self._selected(
-                problem, start, keys, self.tuning.first_residual_px, chosen
-            )
-            # Wide first: what is seen again after a turn disagrees with all tracks at once.
-            wide = part and adjust(part, start, AdjustmentTuning(robust_px=4.0, steps=4))
-            if not wide:
-                return TargetMap(time_s, "inconsistent")
-            part, start, selected = self._selected(
-                problem, wide.estimate, keys, self.tuning.residual_px, selected
-            )
-            found = part and adjust(part, start)
-            if part is None or found is None:
-                return TargetMap(time_s, "inconsistent")
-            adjusted, chosen = found, selected
-            self._turns = {
-                (c, t): turn
-                for c, t, turn in zip(
-                    views.chaser.tolist(), views.time_s.tolist(), found.estimate.turns, strict=True
-                )
-            }
-            problem_now = part
+        last = self._last.estimate
+        seen_at = list(zip(views.chaser.tolist(), views.time_s.tolist(), strict=True))
+        turns = np.array([self._turns.get(at, np.zeros(3)) for at in seen_at])
+        start = MapEstimate(last.motion, last.cameras, turns, last.landmarks_m)
+        part, start, chosen = self._selected(
+            problem, start, keys, self.tuning.first_residual_px, self._keys
+        )
+        # Wide first: what is seen again after a turn disagrees with all tracks at once.
+        wide = part and adjust(part, start, AdjustmentTuning(robust_px=4.0, steps=4))
+        if not wide:
+            return TargetMap(time_s, "inconsistent")
+        part, start, chosen = self._selected(
+            problem, wide.estimate, keys, self.tuning.residual_px, chosen
+        )
+        adjusted = part and adjust(part, start)
+        if part is None or adjusted is None:
+            return TargetMap(time_s, "inconsistent")
+        self._turns = dict(zip(seen_at, adjusted.estimate.turns, strict=True))
         self._last, self._keys = adjusted, chosen
-        self.merges.check(problem_now.observations, adjusted.residual_px, chosen)
-        self.merges.find(problem_now.observations, adjusted, chosen)
+        self.merges.check(part.observations, adjusted.residual_px, chosen)
+        self.merges.find(part.observations, adjusted, chosen)
         self.merges.forget(np.unique(observations.track))
         return self._described(time_s, adjusted, chosen)
 
@@ -378,11 +365,7 @@ class Mapper:
         tracks, keys, number = tracks[single], keys[single], number[single]
         rays, ages_s = rays[single], ages_s[single]
         unique, landmark, counts = np.unique(keys, return_inverse=True, return_counts=True)
-        enough = counts >= self.tuning.least_views
-        if int(enough.sum()) > _MOST_TRACKS:
-            order = np.argsort(-counts, kind="stable")[:_MOST_TRACKS]
-            enough = np.zeros(len(counts), dtype=bool)
-            enough[order] = True
+        enough = _most_seen(counts, counts >= self.tuning.least_views, _MOST_TRACKS)
         place = np.cumsum(enough) - 1
         weight = 1.0 / np.hypot(1.0, ages_s * self.tuning.slide_px_s / self.tuning.fresh_px)
         seen = Observations(number, landmark, rays, tracks, weight, ages_s).by_landmark(
@@ -411,18 +394,13 @@ class Mapper:
             same = known[at] == keys
             points[same] = estimate.landmarks_m[at[same]]
         start = with_landmarks(estimate, points)
-        off = np.linalg.norm(residuals(problem, start), axis=1)
-        off[in_cameras(problem, start)[:, 2] < _BEHIND_M] = _CAP_PX
-        median = medians(off, seen.landmark, len(keys))
+        median = medians(_off_px(problem, start), seen.landmark, len(keys))
         good = (median < limit_px) & (sigma < tuning.landmark_sigma_m)
         if good.any():
             middle = np.median(points[good], axis=0)
             good &= np.linalg.norm(points - middle, axis=1) < tuning.spread_m
-        if int(good.sum()) > tuning.most_landmarks:
-            counts = np.bincount(seen.landmark, minlength=len(keys)) * good
-            order = np.argsort(-counts, kind="stable")[: tuning.most_landmarks]
-            good = np.zeros(len(keys), dtype=bool)
-            good[order] = True
+        counts = np.bincount(seen.landmark, minlength=len(keys))
+        good = _most_seen(counts, good, tuning.most_landmarks)
         if int(good.sum()) < _LEAST_LANDMARKS:
             return None, start, keys
         place = np.cumsum(good) - 1
@@ -434,14 +412,30 @@ _SLACK_S = 1e-6
 """Difference of two times, s, that are the same but for rounding."""
 _ASSUMED_M = 2.0
 """Range from which a single camera starts: it cannot tell."""
-_START_ROUNDS, _ROUNDS = 3, 1
-"""Selections and adjustments of a start, and of an update."""
+_START_ROUNDS = 3
+"""Selections and adjustments of a start."""
 _BEHIND_M, _CAP_PX = 0.1, 10.0
 """Depth of a landmark that counts as behind a camera, and the largest residual, px."""
 _LEAST_LANDMARKS = 30
 """Landmarks without which nothing is adjusted: three times what fixes all unknowns."""
 _MOST_TRACKS = 4000
 """Tracks considered, those seen most often."""
+
+
+def _off_px(problem: Problem, estimate: MapEstimate) -> Array:
+    """Return by how much each observation (k,) is off its landmark; the cap for one behind."""
+    off = np.linalg.norm(residuals(problem, estimate), axis=1)
+    off[in_cameras(problem, estimate)[:, 2] < _BEHIND_M] = _CAP_PX
+    return off
+
+
+def _most_seen(counts: IntArray, good: NDArray[np.bool_], most: int) -> NDArray[np.bool_]:
+    """Return ``good`` (n,) without all but the ``most`` of the largest counts (n,)."""
+    if int(good.sum()) <= most:
+        return good
+    out = np.zeros(len(good), dtype=bool)
+    out[np.argsort(-(counts * good), kind="stable")[:most]] = True
+    return out
 
 
 def _keys(chaser: int, ids: IntArray) -> IntArray:

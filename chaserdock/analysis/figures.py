@@ -501,9 +501,8 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
             )
             fastest = max(fastest, limit * 1e3)
     if any(_docks_at_distance(flight, i) for i in numbers):
-        limit_line(
-            top, s.approach.dock_distance_m, f"docking distance {s.approach.dock_distance_m:g} m"
-        )
+        label = f"docking distance {s.approach.dock_distance_m:g} m"
+        limit_line(top, s.approach.dock_distance_m, label, at="left")
     top.set(ylabel="distance to the target / m", ylim=(nearest * 0.5, None))
     bottom.set(ylabel="closing speed / mm s⁻¹", xlim=_span_s(target.time_s))
     fastest = fastest or s.approach.max_speed_m_s * 1e3

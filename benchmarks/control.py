@@ -3,12 +3,12 @@
 ...]``.
 
 Avoidance, swaps, clutter and tracking in one process; the cost of distances and of orbital motion
-in the plan; allocation, pulses and failures of thrusters; other rates of ticks and carriers.
-`benchmarks/nmpc.py` times the solver.
+in the plan; allocation, pulses and failures of thrusters; other rates of ticks and carriers;
+assurance of commands. `benchmarks/nmpc.py` times the solver.
 """
 
 from common import main
-from parts import closed_loop, orbit_solve, rates, shape_distance, thrusters
+from parts import assurance, closed_loop, orbit_solve, rates, shape_distance, thrusters
 
 GROUPS = (
     closed_loop.GROUP,
@@ -16,6 +16,7 @@ GROUPS = (
     orbit_solve.GROUP,
     thrusters.GROUP,
     rates.GROUP,
+    assurance.GROUP,
 )
 
 if __name__ == "__main__":

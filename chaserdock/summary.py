@@ -63,6 +63,17 @@ class PassiveSafetySummary(Struct, frozen=True, kw_only=True):
     safe_share: float
 
 
+class AssuranceSummary(Struct, frozen=True, kw_only=True):
+    """Commands of a chaser that its assurance changed, those among them that it replaced by the
+    backup, how many by hazard, and the least room (m) to a surface that must not be crossed.
+    """
+
+    changed: int
+    backup: int
+    hazards: dict[str, int]
+    least_room_m: float | None
+
+
 class RendezvousFigures(Struct, frozen=True, kw_only=True):
     """Quantities that the criteria of a published task judge: least margin to the speed limit;
     largest angle from the cone's axis; arrival; first abort, with the least half edge of a cube
@@ -138,6 +149,7 @@ class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     relative_estimate: PoseEstimateErrors | None = None
     capture: Capture | None = None
     passive_safety: PassiveSafetySummary | None = None
+    assurance: AssuranceSummary | None = None
     rendezvous: RendezvousFigures | None = None
     estimated_tracking: EstimatedTracking | None = None
     sightings: SightingCount | None = None

@@ -21,6 +21,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from chaserdock_agents.chaser.assurance.barriers import Barrier
 from chaserdock_models import rotations
 from chaserdock_models.thruster_bodies import BODIES
 from chaserdock_protocol.scenario import load_scenario
@@ -562,6 +563,37 @@ def controller() -> None:
         save(figure, "controller")
 
 
+def assurance() -> None:
+    """Range and force of a chaser that is commanded full force towards the target."""
+    scenario = load_scenario(ROOT / "scenarios" / "four-chaser-docking.toml")
+    body, limits = scenario.chaser, scenario.limits
+    interval_s = 1.0 / scenario.time.rate_hz
+    most = body.force_max_N / body.mass_kg
+    with styled():
+        figure = Figure(figsize=(6.4, 4.4))
+        top, bottom = figure.subplots(2, 1, sharex=True)
+        for k, share in enumerate((0.25, 0.5, 1.0)):
+            distance_m, closing_m_s, rows = 1.5, 0.0, []
+            for tick in range(300):
+                room = distance_m - limits.min_distance_target_m
+                barrier = Barrier("target", np.eye(3)[0], room, -closing_m_s)
+                least = barrier.least_acceleration(share * most, interval_s)
+                given = min(max(-most, least), most)
+                rows.append((tick * interval_s, distance_m, given * body.mass_kg))
+                distance_m += -closing_m_s * interval_s + 0.5 * given * interval_s**2
+                closing_m_s -= given * interval_s
+            time_s, far_m, force_N = np.array(rows).T
+            top.plot(time_s, far_m, color=SERIES[k], label=f"braking_share = {share:g}")
+            bottom.step(time_s, force_N, where="post", color=SERIES[k])
+        top.axhline(limits.min_distance_target_m, color=LIMIT, linestyle=(0, (5, 3)))
+        bottom.axhline(-body.force_max_N, color=INK, linestyle=":", label="as commanded")
+        top.set(ylabel="range / m", ylim=(0.0, None))
+        bottom.set(ylabel="outward force / N", xlabel="time / s")
+        top.legend(loc="upper right", fontsize=7.5)
+        bottom.legend(loc="lower right", fontsize=7.5)
+        save(figure, "assurance")
+
+
 def planar() -> None:
     """``planar-docking`` from above: paths, bodies at the start and when the latches hold."""
     f = flight("planar-docking")
@@ -951,7 +983,8 @@ PICTURES: dict[str, Callable[[], None]] = {
     "perception": perception, "errors": errors, "hosts": hosts, "limits": limits,
     "extend": extend, "knowledge": knowledge, "ros2": ros2, "devices": devices, "frames": frames,
     "laboratory": laboratory, "planar": planar,
-    "controller": controller, "estimation": estimation, "detumble": detumble,
+    "assurance": assurance, "controller": controller, "estimation": estimation,
+    "detumble": detumble,
     "docking": docking, "faults": faults, "steady": steady,
     "results": results, "reproduction-curves": reproduction, "thrusters": thrusters,
     "targets": targets, "track": tracked, "dataset": dataset, "report": report,

@@ -180,6 +180,16 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         max_violation_m=(0.0,),
         wall_solve_s=0.01,
     ),
+    m.AssuranceStatus(
+        **HEAD,
+        chaser=0,
+        state="changed",
+        hazards=("target", "rate"),
+        asked_force_N=V,
+        asked_torque_N_m=V,
+        room_m=0.02,
+        nearest="target",
+    ),
     m.ActuatorCommand(
         **HEAD,
         chaser=0,

@@ -627,6 +627,33 @@ def passive_safety(flight: RecordedFlight, _: Traces) -> Figure:
 
 
 @_figure(
+    "Assurance",
+    "Least room to what must not be crossed (keep-out, other chasers, corridor), with its margins; "
+    "below, the commands that were changed, and thick, those replaced by the backup.",
+)
+def assurance(flight: RecordedFlight, _: Traces) -> Figure:
+    if not flight.assurance:
+        raise MissingData("commands were not assured")
+    figure, (top, bottom) = new_figure(2, height=2.0, height_ratios=(3, 1), sharex=True)
+    for i, history in sorted(flight.assurance.items()):
+        d = decimated(len(history.time_s))
+        label = f"chaser {i}"
+        top.plot(history.time_s[d], history.room_m[d], color=colour(i), linestyle=dashes(i),
+                 label=label)  # fmt: skip
+        for flags, thickness in ((history.changed, 3.0), (history.backup, 8.0)):
+            times = history.time_s[flags]
+            bottom.plot(times, np.full(len(times), i), "|", color=colour(i), markersize=thickness)
+    limit_line(top, 0.0, "limit")
+    top.set(ylabel="room / m")
+    numbers = sorted(flight.assurance)
+    bottom.set(xlabel="time / s", ylabel="chaser", yticks=numbers)
+    bottom.set_ylim(numbers[-1] + 0.6, numbers[0] - 0.6)
+    bottom.set_xlim(_span_s(*(history.time_s for history in flight.assurance.values())))
+    legend_above(top)
+    return figure
+
+
+@_figure(
     "Separation of the chasers",
     "Distance between the centres of each pair of chasers, in the colours of both.",
 )

@@ -17,6 +17,7 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.codec import without_wall_time
 from chaserdock_protocol.messages import (
     ActuatorCommand,
+    AssuranceStatus,
     BodyReference,
     BodyTruth,
     CommandReply,
@@ -224,6 +225,20 @@ class SafetyHistory:
 
 
 @dataclass
+class AssuranceHistory:
+    """What a chaser's assurance did: times (K,) s, room (K,) m (nan where none is known), whether a
+    command was changed (K,), whether by the backup (K,), and the number of commands changed by
+    hazard.
+    """
+
+    time_s: Array
+    room_m: Array
+    changed: NDArray[np.bool_]
+    backup: NDArray[np.bool_]
+    hazards: Counter[str]
+
+
+@dataclass
 class RelativeHistory:
     """Estimated poses of a chaser relative to the target.
 
@@ -295,6 +310,7 @@ class RecordedFlight:
     loads: dict[int, LoadHistory]
     identified: IdentificationHistory | None
     safety: dict[int, SafetyHistory]
+    assurance: dict[int, AssuranceHistory]
     plumes: dict[str, PlumeTotals]
     solves: SolverHistory
     world: WorldHistory
@@ -432,6 +448,8 @@ class _Collector:
     identified: Columns = field(default_factory=lambda: Columns(21))
     stack: StackEstimate | None = None
     safety: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(4)))
+    assurance: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(4)))
+    hazards: dict[int, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     plumes: dict[str, PlumeTotals] = field(default_factory=lambda: defaultdict(PlumeTotals))
     solves: Columns = field(default_factory=lambda: Columns(3))
     statuses: Counter[str] = field(default_factory=Counter)
@@ -474,6 +492,8 @@ class _Collector:
                 self.world.add(message)
             case Sighting() | PortLoad() | PassiveSafety() | DockingStatus() | ActuatorCommand():
                 self._add_of_chaser(message)
+            case AssuranceStatus():
+                self._add_assurance(message)
             case (
                 Event()
                 | MissionEnd()
@@ -484,6 +504,14 @@ class _Collector:
                 | StackEstimate()
             ):
                 self._add_report(message)
+
+    def _add_assurance(self, message: AssuranceStatus) -> None:
+        room_m = math.nan if message.room_m is None else message.room_m
+        backup = message.state == "backup"
+        changed = backup or message.state == "changed"
+        row = (message.sim_time_ns / 1e9, room_m, changed, backup)
+        self.assurance[message.chaser].add(row)
+        self.hazards[message.chaser].update(message.hazards)
 
     def _add_timed(self, record: Record) -> None:
         """Add the time at which a message was sent."""
@@ -639,6 +667,11 @@ def _safety_history(columns: Columns) -> SafetyHistory:
     return SafetyHistory(t[:, 0].copy(), t[:, 1].copy(), t[:, 2].copy(), t[:, 3] > 0.0)
 
 
+def _assurance_history(columns: Columns, hazards: Counter[str]) -> AssuranceHistory:
+    t = columns.table()
+    return AssuranceHistory(t[:, 0].copy(), t[:, 1].copy(), t[:, 2] > 0.0, t[:, 3] > 0.0, hazards)
+
+
 def _identification_history(c: _Collector) -> IdentificationHistory | None:
     if c.stack is None:
         return None
@@ -689,6 +722,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         identified=_identification_history(c),
         plumes=dict(c.plumes),
         safety={i: _safety_history(columns) for i, columns in c.safety.items()},
+        assurance={i: _assurance_history(rows, c.hazards[i]) for i, rows in c.assurance.items()},
         solves=SolverHistory(
             c.solver, solves[:, 0].copy(), solves[:, 1].copy(), solves[:, 2] > 0.0, c.statuses
         ),

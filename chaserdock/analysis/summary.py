@@ -30,6 +30,7 @@ from .actuation import ImpulseTotals
 from .columns import nanoseconds, rows_since
 from .criteria import capture_of, capture_text, criteria_of, judge, reached_time, stack_rest
 from .flight import (
+    AssuranceHistory,
     InnovationHistory,
     RecordedFlight,
     SafetyHistory,
@@ -321,6 +322,8 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             chasers[str(i)]["innovations"] = _innovations(flight.innovations[i], s.settling_s)
         if i in flight.safety:
             chasers[str(i)]["passive_safety"] = _passive_safety(flight.safety[i])
+        if i in flight.assurance:
+            chasers[str(i)]["assurance"] = _assurance(flight.assurance[i])
 
     motion = flight.motion
     apart = (
@@ -475,6 +478,16 @@ def _passive_safety(history: SafetyHistory) -> dict[str, float]:
     }
 
 
+def _assurance(history: AssuranceHistory) -> dict[str, Any]:
+    known = history.room_m[np.isfinite(history.room_m)]
+    return {
+        "changed": int(history.changed.sum()),
+        "backup": int(history.backup.sum()),
+        "hazards": dict(sorted(history.hazards.items())),
+        "least_room_m": float(known.min()) if len(known) else None,
+    }
+
+
 def _events(flight: RecordedFlight) -> list[dict[str, Any]]:
     events = [(e.sim_time_ns, f"{e.process}: {e.what} {e.detail}".strip()) for e in flight.events]
     for r in flight.replies:
@@ -561,7 +574,7 @@ def _chaser_text(i: str, c: dict[str, Any]) -> str:
             f"; estimated relative to it within {relative['position_rms_m'] * 1e3:.2f} mm, "
             f"{math.degrees(relative['orientation_rms_rad']):.3f}° RMS"
         )
-    line += innovations_text(c.get("innovations"))
+    line += innovations_text(c.get("innovations")) + assurance_text(c.get("assurance"))
     if "capture" in c:
         line += capture_text(c["capture"])
     if "rendezvous" in c:
@@ -576,6 +589,14 @@ def innovations_text(found: dict[str, Any] | None) -> str:
     mean = found["mean_per_freedom"]
     used = "" if mean is None else f"mean NIS {mean:.2f} per degree of freedom, "
     return f"; {used}{100.0 * found['above_share']:.1f} % above the 95 % band"
+
+
+def assurance_text(found: dict[str, Any] | None) -> str:
+    """Describe what a chaser's assurance changed as part of a line."""
+    if found is None or not found["changed"]:
+        return ""
+    hazards = ", ".join(found["hazards"])
+    return f"; {found['changed']} commands changed, {found['backup']} by the backup: {hazards}"
 
 
 def _estimates_text(c: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
+    AssuranceStatus,
     BodyReference,
     BodyTruth,
     DockingStatus,
@@ -46,6 +47,7 @@ OF_CHASERS = (
     topics.REFERENCE,
     topics.PLAN,
     topics.SAFETY,
+    topics.ASSURANCE,
 )
 EVENT_TOPICS = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
 """Topics of the list of events, and of its counts."""
@@ -75,6 +77,7 @@ _FIELDS = {
     Reference: "reference",
     Plan: "plan",
     PassiveSafety: "safety",
+    AssuranceStatus: "assurance",
     DockingStatus: "docking",
     Image: "image",
     Sighting: "sighting",
@@ -108,6 +111,7 @@ class ChaserState:
     reference: Reference | None = None
     plan: Plan | None = None
     safety: PassiveSafety | None = None
+    assurance: AssuranceStatus | None = None
     docking: DockingStatus | None = None
     image: Image | None = None
     sighting: Sighting | None = None

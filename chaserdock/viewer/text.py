@@ -154,6 +154,9 @@ def _chaser_faults(i: int, chaser: ChaserState) -> list[str]:
             f"{safety.distance_m:.2f} m "
             f"after {safety.closest_s:.0f} s"
         )
+    if (assured := chaser.assurance) is not None and assured.state in ("changed", "backup"):
+        how = "changed" if assured.state == "changed" else "replaced by the backup"
+        out.append(f"chaser {i}: command {how}: {', '.join(assured.hazards)}")
     if chaser.actuators is not None and chaser.actuators.source != "command":
         out.append(f"chaser {i}: fallback ({chaser.actuators.source}), no valid command")
     if chaser.thrusters is not None:

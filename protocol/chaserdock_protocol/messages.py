@@ -649,6 +649,32 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
     instance: Text = ""
 
 
+Hazard = Literal["target", "chaser", "corridor", "alignment", "closing speed", "rate"]
+"""What a chaser's assurance guards against: too near to the target's centre; to another chaser;
+outside of its corridor's cone; in its corridor with a wrong attitude; too fast towards its port;
+too fast a rotation."""
+
+
+class AssuranceStatus(Message, frozen=True, kw_only=True):
+    """What a chaser's assurance has done with the command of the same tick (``[assurance]``).
+
+    ``state``: ``unchanged``; ``changed``, the nearest command that keeps all conditions;
+    ``backup``, none keeps them, and the one that misses them least is given; ``blind``, the target
+    is unknown, so only the rate is bounded; ``off``, the chaser is latched. ``hazards``: what
+    required a change. ``asked_*``: force and torque as commanded, body axes; those given are in
+    ``ActuatorCommand``. ``room_m``: least distance, with its margin, to a surface that must not be
+    crossed, ``nearest`` its hazard; None where none is known.
+    """
+
+    chaser: ChaserId
+    state: Literal["unchanged", "changed", "backup", "blind", "off"]
+    hazards: Annotated[tuple[Hazard, ...], Meta(max_length=6)]
+    asked_force_N: Vector3
+    asked_torque_N_m: Vector3
+    room_m: float | None = None
+    nearest: Hazard | None = None
+
+
 class Lease(Message, frozen=True, kw_only=True):
     """Command authority over chaser ``chaser``, which it has granted to the controller ``holder``.
 
@@ -890,6 +916,7 @@ VERSION: dict[type[Struct], int] = {
     PassiveSafety: 1,
     SolverStatus: 1,
     ActuatorCommand: 2,
+    AssuranceStatus: 1,
     Lease: 1,
     ThrusterReport: 3,
     Event: 1,

@@ -98,6 +98,7 @@ SIGHTING = _topic(
 ACTUATORS = _topic(
     "chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command"
 )
+ASSURANCE = _topic("chaser/{chaser}/assurance", m.AssuranceStatus, "chaser", set(), "tick", "state")
 THRUSTERS = _topic(
     "chaser/{chaser}/thrusters", m.ThrusterReport, "chaser", {"controller"}, "tick", "state"
 )
@@ -150,6 +151,7 @@ TOPICS: tuple[Topic, ...] = (
     BODY_REFERENCE,
     SIGHTING,
     ACTUATORS,
+    ASSURANCE,
     THRUSTERS,
     LEASE,
     WRENCH,

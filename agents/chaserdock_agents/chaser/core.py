@@ -31,6 +31,7 @@ from chaserdock_protocol.scenario.thrusters import ThrusterFailure
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import ReceivedMessage
 
+from .assurance.assurance import Assurance
 from .command_gate import CommandGate, passed_on
 from .fallback_control import FallbackControl
 from .inbox import ChaserInbox
@@ -69,6 +70,8 @@ class ChaserCore:
         self.fallback = FallbackControl(scenario, number, self.outbox)
         has_thrusters = scenario.chaser.actuation == "thrusters"
         self.thrusters = ThrusterController(scenario, number) if has_thrusters else None
+        self.assurance = None if scenario.assurance is None else Assurance(scenario, number)
+        self._waiting: WrenchCommand | None = None
         self._reports = FailureReports(failures)
         self._has_port = scenario.docking.port_of(number) is not None
         self._observed_tick = self._uncommanded_tick = -1
@@ -89,6 +92,7 @@ class ChaserCore:
             case DockingStatus():
                 if self._is_new(inbox.add_docking(message)):
                     self._observe_thrusters()
+                    self._execute_waiting()
             case Image():
                 return self.look(message)
             case Plan():
@@ -135,6 +139,7 @@ class ChaserCore:
     def _continue_tick(self, odometry: Odometry) -> None:
         """Do what had to wait for the chaser's own state of this tick."""
         self._observe_thrusters()
+        self._execute_waiting()
         self._reply_without_command()
         if self.realtime:
             self._check_command_timeout(odometry)
@@ -162,6 +167,7 @@ class ChaserCore:
                 self._continue_tick(inbox.odometry)
         elif topic is topics.DOCKING and inbox.assume_docking(lost, self.number):
             self._observe_thrusters()
+            self._execute_waiting()
         elif topic is topics.WRENCH and lost.sender in ("", self.gate.leases.holder):
             self._mark_uncommanded(lost.tick)
 
@@ -215,7 +221,10 @@ class ChaserCore:
         self._observed_tick = tick.tick
         self._reports.deliver(self.thrusters, odometry.sim_time_ns)
         touched = docking is not None and (docking.contact or docking.latched)
-        self.outbox.publish(topics.THRUSTERS, self.thrusters.observe(odometry, touched))
+        report = self.thrusters.observe(odometry, touched)
+        if self.assurance is not None:
+            self.assurance.limit_by(report)
+        self.outbox.publish(topics.THRUSTERS, report)
         for level, what, detail in self.thrusters.drain_events():
             self.outbox.event(level, what, detail, odometry.tick, odometry.sim_time_ns)
 
@@ -224,14 +233,33 @@ class ChaserCore:
     def _take_command(self, command: WrenchCommand, now_ns: int) -> None:
         decision = self.gate.decide(command, self.inbox.tick, now_ns)
         if decision.execute is not None:
-            self._execute(decision.execute)
+            self._waiting = decision.execute
+            self._execute_waiting()
         elif decision.uncommanded_tick is not None:
             self._mark_uncommanded(decision.uncommanded_tick)
+
+    def _execute_waiting(self) -> None:
+        """Execute the command that waits, once what is to be known of its tick has arrived.
+
+        In lock-step a command is checked by the state of its own tick, in whatever order they
+        arrive.
+        """
+        command, inbox = self._waiting, self.inbox
+        if command is None:
+            return
+        if self.assurance is not None and not self.realtime:
+            known = [inbox.odometry, *([inbox.docking] if self._has_port else [])]
+            if any(message is None or message.tick < command.tick for message in known):
+                return
+        self._waiting = None
+        self._execute(command)
 
     def _execute(self, command: WrenchCommand) -> None:
         # Only the estimate that came with the previous command is certain to have arrived.
         known = self.fallback.last.target
         self.fallback.end(command)
+        if self.assurance is not None:
+            self.assurance.add_estimate(known)
         # Before the reply: in lock-step the next image follows it, and is to be seen with this
         # geometry.
         if (refused := self.vision.inform(command)) is not None:
@@ -280,6 +308,13 @@ class ChaserCore:
         self._actuate(command, thrusts_N)
 
     def _actuate(self, command: ActuatorCommand, thrusts_N: Array | None = None) -> None:
+        if self.assurance is not None and self.inbox.odometry is not None:
+            self.assurance.add_odometry(self.inbox.odometry)
+            assured = self.assurance.assure(command, thrusts_N, self.inbox.latched)
+            command, thrusts_N = assured.command, assured.thrusts_N
+            self.outbox.publish(topics.ASSURANCE, assured.status)
+            if assured.event is not None:
+                self.outbox.event(*assured.event, command.tick, command.sim_time_ns)
         if self.thrusters is not None:
             command = self.thrusters.add_pulses(command, thrusts_N)
         own = msgspec.structs.replace(command, instance=self.instance)

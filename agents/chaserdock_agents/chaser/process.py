@@ -82,6 +82,8 @@ class ChaserProcess:
             node.advertise(topic, i)
         if core.thrusters is not None:
             node.advertise(topics.THRUSTERS, i)
+        if core.assurance is not None:
+            node.advertise(topics.ASSURANCE, i)
         node.subscribe(topics.IMAGE, i, latest=latest)
         node.subscribe(topics.ODOMETRY, i, latest=latest)
         for topic in (topics.DOCKING, topics.PLAN, topics.WRENCH):

@@ -68,6 +68,8 @@ def check_flight(scenario: FlightScenario) -> None:
             'plume: only thrusters have plumes; it needs chaser.actuation = "thrusters"'
         )
 
+    if scenario.assurance is not None:
+        _check_assurance(scenario)
     if scenario.limits.passive_safety != "off" and scenario.estimator.name != "joint":
         raise ValueError(
             'limits.passive_safety: needs the covariance of estimator.name = "joint", '
@@ -78,6 +80,19 @@ def check_flight(scenario: FlightScenario) -> None:
             'limits.passive_safety: "enforce" needs controller.solver = "rti", '
             f"not {scenario.controller.solver!r}"
         )
+
+
+def _check_assurance(scenario: FlightScenario) -> None:
+    if scenario.estimator.name != "joint":
+        raise ValueError(
+            'assurance: needs the poses and covariances of estimator.name = "joint", not '
+            f"{scenario.estimator.name!r}"
+        )
+    for key in ("min_distance_target_m", "min_distance_chasers_m"):
+        if getattr(scenario.limits, key) == 0.0:
+            raise ValueError(
+                f"assurance: keeps distances between centres; limits.{key} must be above 0"
+            )
 
 
 def check_consistent(scenario: Scenario) -> None:

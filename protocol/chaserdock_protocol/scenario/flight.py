@@ -17,6 +17,7 @@ from chaserdock_models.clock import Timing
 from chaserdock_models.targets import TargetModel
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
+from .assurance import AssuranceSection
 from .bodies import Body, FlightTarget
 from .camera import FlightCamera
 from .checks import check_flight
@@ -80,6 +81,7 @@ class FlightScenario(Section):
     controller: Controller = Controller()
     limits: Limits = Limits()
     approach: Approach = Approach()
+    assurance: AssuranceSection | None = None
     inspection: Inspection = Inspection()
     docking: Docking = Docking()
     detumble: Detumble = Detumble()

@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check each command of a chaser against its safe set, and change it as little as possible.
+
+No I/O. The last stage before actuators: it does not know who commands. It knows the chaser's own
+odometry, the capability of its thrusters, and the newest estimate of the target and the chasers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_models.rigid_body import BodyState
+from chaserdock_models.wrench_set import wrench_matrix
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    AssuranceStatus,
+    Hazard,
+    Level,
+    Odometry,
+    RelativeEstimate,
+    TargetEstimate,
+    ThrusterReport,
+)
+from chaserdock_protocol.scenario import FlightScenario
+
+from .barriers import Barrier, Margin, Offset, PortCorridor, distance_barrier
+from .nearest_input import Conditions, nearest_input
+
+_OLDEST_NS = 30_000_000_000
+"""Age of an estimate of the target beyond which the target counts as unknown, ns: with a velocity
+known to 1 mm/s (three sigmas of the grade `lab`) it may be 3 cm away from where it is expected."""
+_HISTORY_S = 0.4
+"""Time over which the velocity of another chaser is measured from its estimated positions, s. They
+are known to 1 mm, the velocity so to 4 mm/s, and it lags by 0.2 s."""
+_MOST_MARGIN_M = 0.1
+"""Largest margin for errors of the estimate, m: that of the plans (`limits`)."""
+_MOST_MARGIN_M_S = 0.01
+"""Largest margin for errors of velocities, m/s: half the speed of a touch (`docking.tolerances`).
+An estimate states more in its first second only."""
+_PAUSE_NS = 1_000_000_000
+"""Time without a change after which the next one is reported as a new event, ns."""
+_RATE_SHARE = 0.99
+"""Share of the greatest torque that slows a rate beyond its limit: less than all of it, so that
+rounding does not make the condition unsatisfiable."""
+_KNOWN = ("tracking", "predicting")
+State = Literal["unchanged", "changed", "backup", "blind", "off"]
+
+
+@dataclass(frozen=True, eq=False)
+class AssuredCommand:
+    """The command to give, the thrusts (n,) that replace its allocation, and what was done.
+
+    ``event``: level, what and detail, where a series of changes begins, worsens or has ended.
+    """
+
+    command: ActuatorCommand
+    thrusts_N: Array | None
+    status: AssuranceStatus
+    event: tuple[Level, str, str] | None = None
+
+
+@dataclass(frozen=True)
+class _Series:
+    """Changes of commands without a pause: time of the last one, how many, whether any needed the
+    backup.
+    """
+
+    last_ns: int
+    count: int
+    backup: bool
+
+
+class Assurance:
+    """Assures the commands of one chaser.
+
+    Call ``add_estimate`` with the estimates of the target, ``limit_by`` with what the thrusters can
+    give, ``add_odometry`` with the newest odometry, then ``assure`` with every command.
+    """
+
+    def __init__(self, scenario: FlightScenario, chaser: int) -> None:
+        section = scenario.assurance
+        assert section is not None
+        body, limits, docking = scenario.chaser, scenario.limits, scenario.docking
+        self._scenario, self._chaser, self._body = scenario, chaser, body
+        self._interval_s = 1.0 / scenario.time.rate_hz
+        self._share, self._rate_rad_s = section.braking_share, math.radians(section.max_rate_deg_s)
+        self._margin = Margin(limits.estimate_margin_sigmas, _MOST_MARGIN_M, _MOST_MARGIN_M_S)
+        self._inertia, self._limits = np.array(body.inertia), body.wrench_max
+        port = docking.port_of(chaser)
+        self._corridor = None if port is None else PortCorridor(port, body.probe_reach_m, docking)
+        self._wrenches = wrench_matrix(body.thrusters) if body.actuation == "thrusters" else None
+        kept = max(2, math.ceil(_HISTORY_S * scenario.time.rate_hz))
+        self._estimates: deque[TargetEstimate] = deque(maxlen=kept)
+        self._own: deque[Odometry] = deque(maxlen=kept + 2)
+        self._given = np.zeros(6)
+        self._series: _Series | None = None
+
+    def add_estimate(self, estimate: TargetEstimate | None) -> None:
+        """Take the newest estimate of the target."""
+        if estimate is None or estimate.status not in _KNOWN:
+            return
+        if not self._estimates or estimate.tick > self._estimates[-1].tick:
+            self._estimates.append(estimate)
+
+    def add_odometry(self, odometry: Odometry) -> None:
+        """Take the chaser's newest odometry."""
+        if not self._own or odometry.tick > self._own[-1].tick:
+            self._own.append(odometry)
+
+    def limit_by(self, report: ThrusterReport) -> None:
+        """Take the capability of the chaser's thrusters."""
+        self._limits = np.array([*report.force_max_N, *report.torque_max_N_m])
+
+    def assure(
+        self, command: ActuatorCommand, thrusts_N: Array | None, latched: bool
+    ) -> AssuredCommand:
+        """Return the command to give in place of ``command``.
+
+        ``thrusts_N`` (n,): thrusts that were commanded in place of force and torque.
+        """
+        wrench = np.array([*command.force_N, *command.torque_N_m])
+        if thrusts_N is not None and self._wrenches is not None:
+            wrench = self._wrenches @ thrusts_N
+        if latched or not self._own:
+            return AssuredCommand(command, thrusts_N, self._status(command, "off", wrench))
+        q, omega = self._attitude_at(command.effective_time_ns)
+        barriers = self._barriers(command.effective_time_ns, q)
+        on_force, on_torque = self._on_force(barriers, q), self._on_torque(omega)
+        missed = {barriers[k].hazard for k in on_force.missed(wrench[:3])}
+        state: State = "unchanged" if barriers else "blind"
+        if len(on_torque.missed(wrench[3:])):
+            missed.add("rate")
+        given = wrench
+        if missed:
+            force, force_satisfied = nearest_input(wrench[:3], on_force)
+            torque, torque_satisfied = nearest_input(wrench[3:], on_torque)
+            state = "changed" if force_satisfied and torque_satisfied else "backup"
+            given = np.concatenate([force, torque])
+            command = msgspec.structs.replace(
+                command, force_N=vector(force), torque_N_m=vector(torque)
+            )
+            thrusts_N = None
+        self._given = given
+        status = self._status(command, state, wrench, missed, barriers)
+        return AssuredCommand(command, thrusts_N, status, self._event(status))
+
+    def _event(self, status: AssuranceStatus) -> tuple[Level, str, str] | None:
+        """Return what is to be reported of a command, if anything."""
+        series, now_ns = self._series, status.sim_time_ns
+        if status.state in ("changed", "backup"):
+            begins = series is None or (status.state == "backup" and not series.backup)
+            count = 1 if series is None else series.count + 1
+            backup = status.state == "backup" or (series is not None and series.backup)
+            self._series = _Series(now_ns, count, backup)
+            if not begins:
+                return None
+            room = "" if status.room_m is None else f"; room {status.room_m * 1e3:.0f} mm"
+            how = "backup command" if status.state == "backup" else "command changed"
+            return "warning", f"assurance: {how}", ", ".join(status.hazards) + room
+        if series is None or now_ns - series.last_ns < _PAUSE_NS:
+            return None
+        self._series = None
+        return "info", "assurance: commands unchanged again", f"{series.count} were changed"
+
+    # -- what is known -----------------------------------------------------------------------------
+
+    def _attitude_at(self, time_ns: int) -> tuple[Array, Array]:
+        """Return attitude (4,) and rate (3,) of the chaser when the command takes effect."""
+        own = self._own[-1]
+        ahead_s = (time_ns - own.sim_time_ns) / 1e9
+        omega = np.array(own.omega_rad_s)
+        turned = rotations.integrate(np.array(own.q_wxyz), omega, ahead_s)
+        return turned, omega + ahead_s * self._angular_acceleration(omega, self._given[3:])
+
+    def _angular_acceleration(self, omega: Array, torque: Array) -> Array:
+        """Return J^-1 (torque - omega x J omega), body axes, rad/s²."""
+        return (torque - rotations.cross(omega, self._inertia * omega)) / self._inertia
+
+    def _barriers(self, time_ns: int, q: Array) -> list[Barrier]:
+        """Return the conditions on the force at ``time_ns``; none while the target is unknown."""
+        own = self._own[-1]
+        if not self._estimates:
+            return []
+        estimate = self._estimates[-1]
+        relative = {r.chaser: r for r in estimate.relative}
+        age_ns = own.sim_time_ns - estimate.sim_time_ns
+        if self._chaser not in relative or age_ns > _OLDEST_NS:
+            return []
+        target, offset = self._of_target(estimate, relative[self._chaser], own, time_ns)
+        limits, braking = self._scenario.limits, self._braking_m_s2
+        barriers: list[Barrier] = []
+        if self._corridor is not None and self._corridor.holds(offset, target):
+            barriers += self._corridor.barriers(
+                offset, target, q, braking, self._interval_s, self._margin
+            )
+        else:
+            least_m = limits.min_distance_target_m
+            barriers.append(distance_barrier("target", offset, least_m, self._margin))
+        for other in relative.values():
+            if other.chaser != self._chaser:
+                apart = self._of_other(estimate, other, offset, target)
+                least_m = limits.min_distance_chasers_m
+                barriers.append(distance_barrier("chaser", apart, least_m, self._margin))
+        return barriers
+
+    @property
+    def _braking_m_s2(self) -> float:
+        force = self._limits[:3]
+        able = force[self._body.wrench_max[:3] > 0.0]
+        return self._share * float(able.min()) / self._body.mass_kg
+
+    def _of_target(
+        self, estimate: TargetEstimate, relative: RelativeEstimate, own: Odometry, time_ns: int
+    ) -> tuple[BodyState, Offset]:
+        """Return the target, and the chaser's offset from it, both at ``time_ns``.
+
+        From the estimate to the chaser's newest odometry the chaser has moved as that says; from
+        there on it moves under the command before.
+        """
+        velocity, omega = np.array(estimate.velocity_m_s), np.array(estimate.omega_rad_s)
+        q_then = np.array(estimate.q_wxyz)
+        then = next((o for o in self._own if o.tick == estimate.tick), None)
+        age_s, ahead_s = (
+            (own.sim_time_ns - estimate.sim_time_ns) / 1e9,
+            (time_ns - own.sim_time_ns) / 1e9,
+        )
+        position = rotations.rotate(q_then, relative.position_m)
+        if then is None:  # too long ago: odometry and estimate share WRF
+            position = np.subtract(own.position_m, estimate.position_m)
+        else:
+            position = position + np.subtract(own.position_m, then.position_m)
+        drift = np.subtract(own.velocity_m_s, velocity)
+        pushed = rotations.rotate(own.q_wxyz, self._given[:3]) / self._body.mass_kg
+        position = position - velocity * age_s + drift * ahead_s + 0.5 * pushed * ahead_s**2
+        q_target = rotations.integrate(q_then, omega, age_s + ahead_s)
+        covariance = np.reshape(estimate.covariance, (12, 12))[3:6, 3:6]
+        turn = rotations.to_matrix(q_then)
+        own_covariance = np.reshape(relative.covariance, (6, 6))[:3, :3]
+        speed_covariance = np.reshape(own.velocity_covariance_m2_s2, (3, 3)) + covariance
+        target = BodyState(np.array(estimate.position_m), velocity, q_target, omega)
+        return target, Offset(
+            position,
+            drift + pushed * ahead_s,
+            turn @ own_covariance @ turn.T + (age_s + ahead_s) ** 2 * speed_covariance,
+            speed_covariance,
+        )
+
+    def _of_other(
+        self, estimate: TargetEstimate, other: RelativeEstimate, offset: Offset, target: BodyState
+    ) -> Offset:
+        """Return the chaser's offset from another one, which moves on as it did relative to the
+        target.
+        """
+        first = next(
+            (e, r) for e in self._estimates for r in e.relative if r.chaser == other.chaser
+        )
+        at_first = rotations.rotate(first[0].q_wxyz, first[1].position_m)
+        at_last = rotations.rotate(estimate.q_wxyz, other.position_m)
+        elapsed_s = (estimate.sim_time_ns - first[0].sim_time_ns) / 1e9
+        velocity = (at_last - at_first) / elapsed_s if elapsed_s > 0.0 else np.zeros(3)
+        own_age_s = (self._own[-1].sim_time_ns - estimate.sim_time_ns) / 1e9
+        at_last = at_last + velocity * own_age_s
+        turn = rotations.to_matrix(target.q_wxyz)
+        its = turn @ np.reshape(other.covariance, (6, 6))[:3, :3] @ turn.T
+        spread_s = elapsed_s if elapsed_s > 0.0 else self._interval_s
+        return Offset(
+            offset.position_m - at_last,
+            offset.velocity_m_s - velocity,
+            offset.position_covariance + its,
+            offset.velocity_covariance + its / spread_s**2,
+        )
+
+    # -- conditions --------------------------------------------------------------------------------
+
+    def _on_force(self, barriers: list[Barrier], q: Array) -> Conditions:
+        """Return the conditions on the force for an attitude (4,)."""
+        normals = np.array([b.normal for b in barriers]).reshape(-1, 3)
+        least = [b.least_acceleration(self._braking_m_s2, self._interval_s) for b in barriers]
+        rows = rotations.rotate_inverse(q, normals) / self._body.mass_kg
+        return Conditions(rows, np.array(least), self._limits[:3])
+
+    def _on_torque(self, omega: Array) -> Conditions:
+        """Return the condition that the rate (3,) stays within its limit, along its direction."""
+        speed, limits = float(np.linalg.norm(omega)), self._limits[3:]
+        if speed == 0.0:
+            return Conditions(np.zeros((0, 3)), np.zeros(0), limits)
+        about = omega / speed
+        row = -about / self._inertia
+        free = float(about @ self._angular_acceleration(omega, np.zeros(3)))
+        least = free - (self._rate_rad_s - speed) / self._interval_s
+        # A rate beyond its limit falls as fast as it can.
+        able = _RATE_SHARE * float(np.abs(row) @ limits)
+        return Conditions(row[None], np.array([min(least, able)]), limits)
+
+    def _status(
+        self,
+        command: ActuatorCommand,
+        state: State,
+        asked: Array,
+        missed: Iterable[Hazard] = (),
+        barriers: Iterable[Barrier] = (),
+    ) -> AssuranceStatus:
+        rooms = [(b.room_m, b.hazard) for b in barriers if math.isfinite(b.room_m)]
+        room_m, nearest = min(rooms, default=(None, None))
+        return AssuranceStatus(
+            tick=command.tick,
+            sim_time_ns=command.sim_time_ns,
+            chaser=self._chaser,
+            state=state,
+            hazards=tuple(sorted(missed)),
+            asked_force_N=vector(asked[:3]),
+            asked_torque_N_m=vector(asked[3:]),
+            room_m=room_m,
+            nearest=nearest,
+        )

@@ -60,7 +60,7 @@ _TARGET = _Rigid(100.0, (6.0, 9.0, 11.0))
 
 
 @dataclass
-class Outcome:
+class AttackOutcome:
     """The worst of a flight, by the truth.
 
     ``*_room_m``: least distance beyond what must be kept from the target and between chasers, and
@@ -125,9 +125,9 @@ class AssuredFlight:
         omega = rotations.rotate_inverse(q, spin)
         return np.concatenate([target[:3] + away, velocity, q, omega])
 
-    def fly(self, duration_s: float) -> Outcome:
+    def fly(self, duration_s: float) -> AttackOutcome:
         """Return the outcome after ``duration_s``."""
-        outcome, timing = Outcome(), self.scenario.timing
+        outcome, timing = AttackOutcome(), self.scenario.timing
         given = [np.zeros(6)] * self._count
         late_s = (timing.effective_ns(0)) / 1e9
         interval_s = 1.0 / self.scenario.time.rate_hz
@@ -262,7 +262,7 @@ class AssuredFlight:
             relative=tuple(relative),
         )
 
-    def _judge(self, outcome: Outcome, statuses: list[AssuranceStatus]) -> None:
+    def _judge(self, outcome: AttackOutcome, statuses: list[AssuranceStatus]) -> None:
         """Add the state of the truth, and what the assurances did, to the outcome."""
         limits, target = self.scenario.limits, self._target
         for i, state in enumerate(self._chasers):
@@ -282,7 +282,7 @@ class AssuredFlight:
         for status in statuses:
             outcome.states[status.state] = outcome.states.get(status.state, 0) + 1
 
-    def _in_corridor(self, i: int, away: Array, state: Array, outcome: Outcome) -> bool:
+    def _in_corridor(self, i: int, away: Array, state: Array, outcome: AttackOutcome) -> bool:
         docking, target = self.scenario.docking, self._target
         port = docking.port_of(i)
         if port is None:
@@ -316,9 +316,9 @@ def _facing(ahead: Array) -> Array:
     return rotations.from_matrix(np.column_stack([ahead, side, np.cross(ahead, side)]))
 
 
-def worst(scenario: Scenario, attack: Attack, seeds: range, duration_s: float) -> Outcome:
+def worst(scenario: Scenario, attack: Attack, seeds: range, duration_s: float) -> AttackOutcome:
     """Return the worst of flights over seeds."""
-    out = Outcome()
+    out = AttackOutcome()
     for seed in seeds:
         one = AssuredFlight(scenario, attack, seed).fly(duration_s)
         for name in ("target_room_m", "chaser_room_m", "corridor_room_m", "gap_m"):

@@ -16,7 +16,7 @@ from chaserdock_agents.chaser.assurance.barriers import (
     SETTLING_S,
     Barrier,
     Margin,
-    Offset,
+    OffsetEstimate,
     PortCorridor,
     distance_barrier,
     stopping_speed,
@@ -96,12 +96,14 @@ def test_a_drift_is_taken_off_and_a_speed_limit_holds_alone() -> None:
 
 def test_margins_are_those_along_the_normal_and_bounded() -> None:
     covariance = np.diag([4e-6, 1e-6, 9.0])
-    offset = Offset(np.array([0.0, 2.0, 0.0]), np.array([0.3, -0.1, 0.2]), covariance, covariance)
+    offset = OffsetEstimate(
+        np.array([0.0, 2.0, 0.0]), np.array([0.3, -0.1, 0.2]), covariance, covariance
+    )
     barrier = distance_barrier("target", offset, 0.5, NO_MARGIN)
     assert barrier.normal == pytest.approx([0.0, 1.0, 0.0])
     assert barrier.room_m == pytest.approx(1.5 - 0.003)
     assert barrier.rate_m_s == pytest.approx(-0.1 - 0.003)
-    wide = Offset(np.array([0.0, 0.0, 2.0]), np.zeros(3), covariance, covariance)
+    wide = OffsetEstimate(np.array([0.0, 0.0, 2.0]), np.zeros(3), covariance, covariance)
     barrier = distance_barrier("chaser", wide, 0.5, NO_MARGIN)
     assert barrier.room_m == pytest.approx(1.5 - NO_MARGIN.most_m)
     assert barrier.rate_m_s == pytest.approx(-NO_MARGIN.most_m_s)
@@ -122,7 +124,7 @@ def test_in_the_corridor_a_uniform_motion_has_the_drift_that_it_is_seen_with(
 
     def barriers(time_s: float) -> list[Barrier]:
         turned = rotations.integrate(q, omega, time_s)
-        offset = Offset(start + velocity * time_s, velocity, EXACT, EXACT)
+        offset = OffsetEstimate(start + velocity * time_s, velocity, EXACT, EXACT)
         target = BodyState(np.zeros(3), np.zeros(3), turned, omega)
         assert corridor.holds(offset, target)
         attitude = rotations.multiply(turned, _looking_along(-np.asarray(port.axis)))
@@ -142,7 +144,7 @@ def test_a_wrong_attitude_closes_the_corridor(tmp_path: Path) -> None:
     port = docking.port_of(0)
     assert port is not None
     target = BodyState(np.zeros(3), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
-    offset = Offset(centre_offset(port, reach, 0.2), np.zeros(3), EXACT, EXACT)
+    offset = OffsetEstimate(centre_offset(port, reach, 0.2), np.zeros(3), EXACT, EXACT)
     right = _looking_along(-np.asarray(port.axis))
     wrong = rotations.multiply(right, rotations.exp(np.array([0.0, math.radians(6.0), 0.0])))
     corridor = PortCorridor(port, reach, docking)

@@ -32,7 +32,7 @@ from chaserdock_protocol.messages import (
 )
 from chaserdock_protocol.scenario import FlightScenario
 
-from .barriers import Barrier, Margin, Offset, PortCorridor, distance_barrier
+from .barriers import Barrier, Margin, OffsetEstimate, PortCorridor, distance_barrier
 from .nearest_input import Conditions, nearest_input
 
 _OLDEST_NS = 30_000_000_000
@@ -220,7 +220,7 @@ class Assurance:
 
     def _of_target(
         self, estimate: TargetEstimate, relative: RelativeEstimate, own: Odometry, time_ns: int
-    ) -> tuple[BodyState, Offset]:
+    ) -> tuple[BodyState, OffsetEstimate]:
         """Return the target, and the chaser's offset from it, both at ``time_ns``.
 
         From the estimate to the chaser's newest odometry the chaser has moved as that says; from
@@ -247,7 +247,7 @@ class Assurance:
         own_covariance = np.reshape(relative.covariance, (6, 6))[:3, :3]
         speed_covariance = np.reshape(own.velocity_covariance_m2_s2, (3, 3)) + covariance
         target = BodyState(np.array(estimate.position_m), velocity, q_target, omega)
-        return target, Offset(
+        return target, OffsetEstimate(
             position,
             drift + pushed * ahead_s,
             turn @ own_covariance @ turn.T + (age_s + ahead_s) ** 2 * speed_covariance,
@@ -255,8 +255,12 @@ class Assurance:
         )
 
     def _of_other(
-        self, estimate: TargetEstimate, other: RelativeEstimate, offset: Offset, target: BodyState
-    ) -> Offset:
+        self,
+        estimate: TargetEstimate,
+        other: RelativeEstimate,
+        offset: OffsetEstimate,
+        target: BodyState,
+    ) -> OffsetEstimate:
         """Return the chaser's offset from another one, which moves on as it did relative to the
         target.
         """
@@ -272,7 +276,7 @@ class Assurance:
         turn = rotations.to_matrix(target.q_wxyz)
         its = turn @ np.reshape(other.covariance, (6, 6))[:3, :3] @ turn.T
         spread_s = elapsed_s if elapsed_s > 0.0 else self._interval_s
-        return Offset(
+        return OffsetEstimate(
             offset.position_m - at_last,
             offset.velocity_m_s - velocity,
             offset.position_covariance + its,
@@ -309,8 +313,8 @@ class Assurance:
         missed: Iterable[Hazard] = (),
         barriers: Iterable[Barrier] = (),
     ) -> AssuranceStatus:
-        rooms = [(b.room_m, b.hazard) for b in barriers if math.isfinite(b.room_m)]
-        room_m, nearest = min(rooms, default=(None, None))
+        surfaces = [b for b in barriers if math.isfinite(b.room_m)]
+        nearest = min(surfaces, key=lambda b: b.room_m, default=None)
         return AssuranceStatus(
             tick=command.tick,
             sim_time_ns=command.sim_time_ns,
@@ -319,6 +323,6 @@ class Assurance:
             hazards=tuple(sorted(missed)),
             asked_force_N=vector(asked[:3]),
             asked_torque_N_m=vector(asked[3:]),
-            room_m=room_m,
-            nearest=nearest,
+            room_m=None if nearest is None else nearest.room_m,
+            nearest=None if nearest is None else nearest.hazard,
         )

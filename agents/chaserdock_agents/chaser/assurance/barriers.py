@@ -91,7 +91,7 @@ def stopping_speed(room_m: float, rate_m_s: float, braking_m_s2: float, interval
 
 
 @dataclass(frozen=True, eq=False)
-class Offset:
+class OffsetEstimate:
     """Position and velocity (3,) of a chaser relative to another body, with covariances (3, 3)."""
 
     position_m: Array
@@ -122,7 +122,9 @@ class Margin:
     most_m_s: float
 
 
-def distance_barrier(hazard: Hazard, offset: Offset, least_m: float, margin: Margin) -> Barrier:
+def distance_barrier(
+    hazard: Hazard, offset: OffsetEstimate, least_m: float, margin: Margin
+) -> Barrier:
     """Return the barrier that keeps a distance between two centres.
 
     The sideways velocity only adds to the distance; it is left out.
@@ -145,7 +147,7 @@ class PortCorridor:
     reach_m: float
     docking: Docking
 
-    def holds(self, offset: Offset, target: BodyState) -> bool:
+    def holds(self, offset: OffsetEstimate, target: BodyState) -> bool:
         """Return whether the centre is in the cone."""
         gap_m, aside, _ = self._seen(offset, target)
         rooms = [room_m for _, room_m in self._facets(gap_m, aside)]
@@ -161,7 +163,7 @@ class PortCorridor:
         for outward in _around(axis):
             yield (slope * axis - outward) / size, (radius_m - float(aside @ outward)) / size
 
-    def _seen(self, offset: Offset, target: BodyState) -> tuple[float, Array, Array]:
+    def _seen(self, offset: OffsetEstimate, target: BodyState) -> tuple[float, Array, Array]:
         """Return the gap, the offset from the axis (3,), and the velocity (3,) relative to the
         rotating target, in TRF.
         """
@@ -173,7 +175,7 @@ class PortCorridor:
         return along_m - self.reach_m, away - along_m * axis, velocity
 
     def barriers(
-        self, offset: Offset, target: BodyState, q_wxyz: Array, braking_m_s2: float,
+        self, offset: OffsetEstimate, target: BodyState, q_wxyz: Array, braking_m_s2: float,
         interval_s: float, margin: Margin,
     ) -> Iterator[Barrier]:  # fmt: skip
         """Yield the conditions on a chaser in the cone, with attitude ``q_wxyz`` (4,)."""
@@ -221,9 +223,9 @@ class PortCorridor:
 
 def _around(axis: Array) -> Iterator[Array]:
     """Yield ``_FACETS`` unit vectors (3,) perpendicular to an axis, at equal angles."""
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    first = rotations.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first /= np.linalg.norm(first)
-    second = np.cross(axis, first)
+    second = rotations.cross(axis, first)
     for k in range(_FACETS):
         angle = 2.0 * math.pi * k / _FACETS
         yield math.cos(angle) * first + math.sin(angle) * second

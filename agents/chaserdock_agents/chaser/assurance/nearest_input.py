@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import daqp
 import numpy as np
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, IntArray
 
 _SOLVED = 1  # daqp's code
 _FREE = 1e30  # daqp takes a bound as large as none
@@ -35,7 +35,7 @@ class Conditions:
         """Return by how much an input (3,), clipped to its limits, exceeds each condition, (k,)."""
         return self.rows @ np.clip(asked, -self.limits, self.limits) - self.least
 
-    def missed(self, asked: Array) -> Array:
+    def missed(self, asked: Array) -> IntArray:
         """Return the numbers (m,) of the conditions that an input (3,) does not satisfy."""
         return np.flatnonzero(self.margins(asked) < -_TOLERANCE)
 

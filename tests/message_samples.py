@@ -235,6 +235,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         term=2,
         operated=(m.OperatorCommand(command="hold", chaser=1),),
         state=b"\x80",
+        commanded=(m.CommandedWrench(chaser=1, force_N=V, torque_N_m=V),),
     ),
     m.Presence(
         **HEAD, process="chaser/0", instance="abc", heard={"controller": "c1", "world": "w1"}

@@ -12,6 +12,7 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage, create_fault_layer
 from chaserdock_protocol.leases import defect_of, no_command
 from chaserdock_protocol.messages import (
+    CommandedWrench,
     CommandReply,
     ControllerState,
     DockingStatus,
@@ -266,6 +267,7 @@ class ControllerProcess:
         wall_s = self.now_s() - start_s
         self._last_result = (tick, out, wall_s)
         self.done_tick = tick.tick
+        self._take_commanded()
         if leads:
             self._publish(tick, out, wall_s, operated)
         if tick.tick % self.scenario.time.rate_hz == 0:
@@ -281,7 +283,12 @@ class ControllerProcess:
         if self.standby.others:
             # State before wrenches: once a tick is answered, the standby must know the commands
             # that were processed with it.
-            self._publish_state(tick, operated=operated)
+            commanded = tuple(
+                CommandedWrench(chaser=i, force_N=w.force_N, torque_N_m=w.torque_N_m)
+                for i, w in out.wrenches.items()
+                if self.realtime
+            )
+            self._publish_state(tick, operated=operated, commanded=commanded)
         node.publish(topics.TARGET, out.target)
         if out.stack is not None:
             node.publish(topics.STACK, out.stack)
@@ -420,11 +427,18 @@ class ControllerProcess:
         leader = self.standby.leader
         self.requests.refuse(tick, "" if leader is None else leader.name)
 
+    def _take_commanded(self) -> None:
+        """Take what another leader has commanded in place of what this process computed."""
+        for tick, wrenches in self.standby.take_commanded(self.done_tick).items():
+            if not self.standby.leads_at(tick):
+                self.core.output.take_commanded(tick, wrenches)
+
     def _apply_leader_state(self, state: ControllerState) -> None:
         if self.standby.is_deposed(state):
             self.node.counts.stale += 1
         elif not state.state:
             self.standby.add_leader_commands(state)
+            self._take_commanded()
         elif self.standby.needs_state(state.tick, self.done_tick):
             try:
                 self.checkpoint.restore(state.state)

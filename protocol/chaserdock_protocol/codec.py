@@ -258,7 +258,9 @@ def vector(array: Any) -> Any:
     return tuple((array if array.ndim == 1 else array.ravel()).tolist())
 
 
-_LATER_FIELDS = frozenset({"given_thrusters_N_s", "geometry", "ranging", "expected", "acquiring"})
+_LATER_FIELDS = frozenset(
+    {"given_thrusters_N_s", "geometry", "ranging", "expected", "acquiring", "commanded"}
+)
 
 
 def without_wall_time(message: Message) -> dict[str, Any]:

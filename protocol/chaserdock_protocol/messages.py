@@ -783,12 +783,21 @@ class CommandReply(Message, frozen=True, kw_only=True):
     operator: Text = ""
 
 
+class CommandedWrench(Struct, frozen=True, kw_only=True):
+    """Force and torque that were commanded to a chaser, body axes."""
+
+    chaser: ChaserId
+    force_N: Vector3
+    torque_N_m: Vector3
+
+
 class ControllerState(Message, frozen=True, kw_only=True):
     """Report of the commanding controller to standbys that it has completed the tick.
 
-    ``operated``: operator commands of the tick. ``state``: serialized controller state after the
-    tick, for standbys that joined late; sent at intervals, else empty. ``process``, ``instance``
-    and ``term``: of the sender; see ``Lease``.
+    ``operated``: operator commands of the tick. ``commanded``: its commands, in real time, where a
+    standby may have computed others; a standby takes these for what acts on the chasers. ``state``:
+    serialized controller state after the tick, for standbys that joined late; sent at intervals,
+    else empty. ``process``, ``instance`` and ``term``: of the sender; see ``Lease``.
     """
 
     process: Text
@@ -796,6 +805,7 @@ class ControllerState(Message, frozen=True, kw_only=True):
     operated: Annotated[tuple[OperatorCommand, ...], Meta(max_length=1024)] = ()
     state: Annotated[bytes, Meta(max_length=4_000_000)] = b""
     instance: Text = ""
+    commanded: Annotated[tuple[CommandedWrench, ...], Meta(max_length=256)] = ()
 
 
 class ThrusterFaultCommand(Struct, frozen=True, kw_only=True):

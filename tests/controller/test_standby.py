@@ -15,6 +15,7 @@ import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import Glide, Move, stay
+from chaserdock_controller.ingest.latency_compensation import CommandHistory
 from chaserdock_controller.process import ControllerProcess
 from chaserdock_controller.redundancy.checkpoint import (
     OWN_ARRAYS,
@@ -28,7 +29,13 @@ from chaserdock_controller.redundancy.standby import HotStandby
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import without_wall_time
-from chaserdock_protocol.messages import ControllerState, Lease, OperatorCommand, Tick
+from chaserdock_protocol.messages import (
+    CommandedWrench,
+    ControllerState,
+    Lease,
+    OperatorCommand,
+    Tick,
+)
 from chaserdock_protocol.recording.log import read_log, read_scenario
 from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
@@ -555,6 +562,30 @@ def test_state_messages_cover_one_tick_in_lockstep_and_all_in_real_time() -> Non
         standby.leader_commands = {3: (hold,), 4: ()}
         assert standby.take_leader_commands(4) == expected
         assert not standby.take_leader_commands(5)
+
+
+def test_a_follower_takes_the_commands_of_the_commander_for_what_acts_on_the_chasers() -> None:
+    state = ControllerState(
+        tick=7,
+        process="controller",
+        instance="c",
+        term=3,
+        commanded=(
+            CommandedWrench(chaser=1, force_N=(0.1, -0.2, 0.3), torque_N_m=(0.01, 0.02, -0.03)),
+        ),
+    )
+    standby = HotStandby("standby", realtime=True)
+    standby.add_leader_commands(state)
+    assert standby.take_commanded(6) == {}
+    assert standby.take_commanded(8) == {7: state.commanded}
+    assert standby.take_commanded(8) == {}
+    history = CommandHistory()
+    for time_ns, force in ((100, 1.0), (200, 2.0), (300, 3.0)):
+        history.add(time_ns, np.full(6, force))
+    history.replace(200, np.full(6, -5.0))
+    history.replace(250, np.full(6, 4.0))
+    acting = [(begin, wrench[0]) for begin, _, wrench in history.segments(100, 400)]
+    assert acting == [(100, 1.0), (200, -5.0), (250, 4.0), (300, 3.0)]
 
 
 def test_state_message_is_encoded_like_any_other() -> None:

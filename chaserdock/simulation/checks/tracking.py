@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_protocol.messages import BodyTruth, Reference, TargetEstimate
+from chaserdock_protocol.messages import ActuatorCommand, BodyTruth, Reference, TargetEstimate
 
 from ..mission import SimulatedFlight
 from .check import Check
@@ -40,10 +40,11 @@ TRACKING = Expectation(
 
 @dataclass
 class TrackingAccuracy(Check):
-    """While nothing has disturbed the flight for ``SETTLED_S``, the mean distance of a chaser from
-    its reference relative to the true target, over that expected by the covariance of its relative
-    pose and by the resolution of its actuators, is at most ``FLIGHT_TRACKING`` in a flight, and
-    over many such flights ``LEAST_TRACKING`` to ``MOST_TRACKING``.
+    """While nothing has disturbed the flight, and the chaser has had its commands, for
+    ``SETTLED_S``, the mean distance of a chaser from its reference relative to the true target,
+    over that expected by the covariance of its relative pose and by the resolution of its
+    actuators, is at most ``FLIGHT_TRACKING`` in a flight, and over many such flights
+    ``LEAST_TRACKING`` to ``MOST_TRACKING``.
 
     ``values``: normalized errors by chaser, one a second.
     """
@@ -58,10 +59,16 @@ class TrackingAccuracy(Check):
     values: dict[int, list[float]] = field(default_factory=dict)
     _estimate: TargetEstimate | None = None
     _blocked: set[int] = field(default_factory=set)
+    _alone_s: dict[int, float] = field(default_factory=dict)
 
     @reads(TargetEstimate)
     def note(self, estimate: TargetEstimate) -> None:
         self._estimate = estimate
+
+    @reads(ActuatorCommand)
+    def note_alone(self, command: ActuatorCommand) -> None:
+        if command.source != "command":
+            self._alone_s[command.chaser] = self.view.time_s
 
     @reads(Reference)
     def measure(self, reference: Reference) -> None:
@@ -72,6 +79,7 @@ class TrackingAccuracy(Check):
         if own.sim_time_ns != reference.sim_time_ns or tick % self.scenario.time.rate_hz:
             return
         disturbed_s = view.causes.lasted_until_s(view.causes.faults, view.time_s)
+        disturbed_s = max(disturbed_s, self._alone_s.get(i, -math.inf))
         settled = view.time_s - disturbed_s >= SETTLED_S and not view.is_on_its_own(i)
         relative = next((r for r in known.relative if r.chaser == i), None)
         if not settled or own.body in view.touching or relative is None:

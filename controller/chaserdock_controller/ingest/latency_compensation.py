@@ -24,6 +24,12 @@ class CommandHistory:
         """Add a command. Times must not decrease."""
         self._sent.append((effective_ns, np.array(wrench)))
 
+    def replace(self, effective_ns: int, wrench: Array) -> None:
+        """Replace what was sent for a time by what another controller has sent for it."""
+        kept = [(t, w) for t, w in self._sent if t != effective_ns]
+        at = sum(t < effective_ns for t, _ in kept)
+        self._sent = [*kept[:at], (effective_ns, np.array(wrench)), *kept[at:]]
+
     def segments(self, from_ns: int, to_ns: int) -> list[tuple[int, int, Array]]:
         """Return the wrenches between two times as (from, to, wrench); zero before the first
         command.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,12 @@ from chaserdock_models.braking import brake_wrench
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.setpoint_tracking import Setpoint, track_setpoint
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import ExpectedPose, GeometryEstimate, WrenchCommand
+from chaserdock_protocol.messages import (
+    CommandedWrench,
+    ExpectedPose,
+    GeometryEstimate,
+    WrenchCommand,
+)
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.ingest.latency_compensation import CommandHistory
@@ -188,6 +194,14 @@ class OutputStage:
             return None
         own = estimate.own.state
         return expected_pose(estimation.target, own, self._camera, o.time_ns, self._period_s)
+
+    def take_commanded(self, tick: int, wrenches: Iterable[CommandedWrench]) -> None:
+        """Replace the commands of a tick by those that another controller has sent."""
+        effective_ns = self._scenario.timing.effective_ns(tick)
+        for w in wrenches:
+            if w.chaser < len(self.sent):
+                wrench = np.array([*w.force_N, *w.torque_N_m])
+                self.sent[w.chaser].replace(effective_ns, wrench)
 
     def _send(
         self,

@@ -14,7 +14,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from chaserdock_protocol.lease_holder import Commander, LeaseHolder
-from chaserdock_protocol.messages import ControllerState, OperatorCommand, Tick
+from chaserdock_protocol.messages import (
+    CommandedWrench,
+    ControllerState,
+    OperatorCommand,
+    Tick,
+)
 from chaserdock_protocol.transport import ReceivedMessage
 
 _MISSABLE_TICKS = 10
@@ -44,6 +49,7 @@ class HotStandby:
     leader: Commander | None = None
     replayed: Commander | None = None
     leader_commands: dict[int, tuple[OperatorCommand, ...]] = field(default_factory=dict)
+    commanded: dict[int, tuple[CommandedWrench, ...]] = field(default_factory=dict)
     _held: deque[ReceivedMessage] = field(default_factory=lambda: deque(maxlen=_MOST_HELD))
     _synced: bool = True
     _missed: bool = False
@@ -181,8 +187,10 @@ class HotStandby:
         return state.term <= max(self.leases.term, 0 if leader is None else leader.term)
 
     def add_leader_commands(self, state: ControllerState) -> None:
-        """Store the operator commands that the leader has processed in a tick."""
+        """Store the operator commands that the leader has processed in a tick, and its wrenches."""
         self.leader_commands[state.tick] = state.operated
+        if state.commanded:
+            self.commanded[state.tick] = state.commanded
 
     def has_leader_commands(self, tick: int) -> bool:
         """Return whether the operator commands of a tick are known or need not be waited for."""
@@ -201,6 +209,15 @@ class HotStandby:
             t: c for t, c in self.leader_commands.items() if t > tick and not self.realtime
         }
         return tuple(command for group in commands for command in group)
+
+    def take_commanded(self, done_tick: int) -> dict[int, tuple[CommandedWrench, ...]]:
+        """Return, by tick, the wrenches of another leader up to a tick that this process has
+        processed, and forget them.
+        """
+        done = {t: wrenches for t, wrenches in sorted(self.commanded.items()) if t <= done_tick}
+        for tick in done:
+            del self.commanded[tick]
+        return done
 
     def needs_state(self, tick: int, done_tick: int) -> bool:
         """Return whether to restore the leader's state after a tick."""

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The surface of a mapped target: closed, near the true one, and marked where nothing was seen."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from chaserdock_agents.mapper.surface import MappedSurface, SightLines, surface_of
+from chaserdock_models.arrays import Array
+
+BOXES = (
+    (np.array([0.0, 0.0, 0.0]), np.array([0.3, 0.2, 0.25])),
+    (np.array([0.0, 0.55, 0.02]), np.array([0.02, 0.3, 0.2])),
+)
+"""Centre and half edges of a bus and of a panel beside it, with a gap of 5 cm between them."""
+SIGMA_M = 0.003
+
+
+def points_on_boxes(rng: np.random.Generator, count: int) -> Array:
+    """Return points on the surfaces of the boxes, also on their edges and corners."""
+    out = []
+    for centre, half in BOXES:
+        for axis in range(3):
+            for side in (-1.0, 1.0):
+                p = rng.uniform(-1.0, 1.0, (count, 3))
+                p[: count // 4] = np.sign(p[: count // 4])
+                p[:, axis] = side
+                out.append(centre + p * half)
+    return np.unique(np.round(np.concatenate(out), 6), axis=0)
+
+
+def distance_outside(points: Array) -> Array:
+    """Return the distance of points from the boxes, negative inside."""
+    out = np.full(len(points), np.inf)
+    for centre, half in BOXES:
+        off = np.abs(points - centre) - half
+        beyond = np.linalg.norm(np.maximum(off, 0.0), axis=1)
+        out = np.minimum(out, np.where((off < 0.0).all(axis=1), off.max(axis=1), beyond))
+    return out
+
+
+def visible(camera: Array, points: Array) -> Array:
+    """Return whether points (n, 3) are seen from a camera, by samples along the lines of sight."""
+    out = np.ones(len(points), dtype=bool)
+    for share in np.linspace(0.02, 0.98, 97):
+        out &= distance_outside(points + share * (camera - points)) > 0.0
+    return out
+
+
+def mapped(
+    seed: int, cameras: Array, wrong: int = 0, count: int = 40
+) -> tuple[MappedSurface, Array]:
+    """Return the surface of noisy landmarks, and the true places of what was seen."""
+    rng = np.random.default_rng(seed)
+    points = points_on_boxes(rng, count)
+    numbers, places = [], []
+    for camera in cameras:
+        found = np.flatnonzero(visible(camera, points))
+        numbers.append(found)
+        places.append(np.tile(camera, (len(found), 1)))
+    seen_often = np.flatnonzero(np.bincount(np.concatenate(numbers), minlength=len(points)) >= 2)
+    renamed = {int(k): i for i, k in enumerate(seen_often)}
+    pairs = [
+        (renamed[int(k)], camera)
+        for found, at in zip(numbers, places, strict=True)
+        for k, camera in zip(found, at, strict=True)
+        if int(k) in renamed
+    ]
+    landmarks = points[seen_often] + SIGMA_M * rng.normal(size=(len(seen_often), 3))
+    landmarks[:wrong] += rng.normal(size=(wrong, 3)) * 0.1
+    covariances = np.tile(SIGMA_M**2 * np.eye(3), (len(landmarks), 1, 1))
+    sights = SightLines(np.array([k for k, _ in pairs]), np.array([c for _, c in pairs]))
+    surface = surface_of(landmarks, covariances, sights)
+    assert surface is not None
+    return surface, points[seen_often]
+
+
+def around(count: int, height: float = 0.0) -> Array:
+    """Return cameras on a circle of 2 m about z."""
+    angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    circle = [2.0 * np.cos(angles), 2.0 * np.sin(angles), np.full(count, height)]
+    return np.column_stack(circle)
+
+
+EVERYWHERE = np.concatenate([around(12), around(8, 1.6), around(8, -1.6)])
+
+
+def sampled(surface: MappedSurface, keep: Array | None = None) -> Array:
+    """Return points on the triangles of a surface, weighted by their areas."""
+    rng = np.random.default_rng(9)
+    triangles = surface.triangles if keep is None else surface.triangles[keep]
+    a, b, c = (surface.vertices_m[triangles[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    at = rng.choice(len(triangles), 4000, p=area / area.sum())
+    u, v = np.sort(rng.uniform(size=(2, 4000)), axis=0)
+    u, v = u[:, None], v[:, None]
+    return u * a[at] + (v - u) * b[at] + (1.0 - v) * c[at]
+
+
+@pytest.mark.parametrize("wrong", [0, 4])
+def test_the_surface_is_closed_near_the_true_one_and_leaves_the_gap_free(wrong: int) -> None:
+    surface, _ = mapped(1, EVERYWHERE, wrong)
+    edges = Counter((int(t[i]), int(t[(i + 1) % 3])) for t in surface.triangles for i in range(3))
+    assert all(count == edges[b, a] for (a, b), count in edges.items())
+    off = distance_outside(sampled(surface))
+    assert np.abs(np.median(off)) < 0.004
+    low, high = np.quantile(off, [0.05, 0.95])
+    assert low > -0.025
+    assert high < 0.02  # nothing stands in the gap of 5 cm
+    true_volume = sum(8.0 * np.prod(half) for _, half in BOXES)
+    assert surface.volume_m3() == pytest.approx(true_volume, rel=0.15)
+    assert surface.seen.mean() > 0.9
+    assert surface.sigma_m == pytest.approx(SIGMA_M)
+
+
+def test_normals_point_outwards() -> None:
+    surface, _ = mapped(2, EVERYWHERE)
+    corners = surface.vertices_m[surface.triangles]
+    middles, normals = corners.mean(axis=1), surface.normals()
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    bus = np.abs(middles[:, 1]) < 0.21  # the panel is thinner than the step
+    outside = distance_outside(middles + 0.04 * normals)
+    inside = distance_outside(middles - 0.04 * normals)
+    right = (outside > inside)[bus]
+    assert (area[bus] * right).sum() > 0.9 * area[bus].sum()
+
+
+def test_what_no_camera_saw_is_marked_and_not_empty() -> None:
+    half = around(12)[around(12)[:, 0] > 0.2]
+    surface, seen_points = mapped(3, half)
+    normals = surface.normals()
+    behind = normals[:, 0] < -0.5
+    assert behind.any()
+    assert surface.seen[behind].mean() < 0.1
+    assert surface.seen[normals[:, 0] > 0.5].mean() > 0.9
+    hull_volume = np.prod(np.ptp(seen_points, axis=0))
+    assert 0.0 < surface.volume_m3() < hull_volume
+
+
+def test_too_few_landmarks_are_no_surface() -> None:
+    points = np.random.default_rng(0).normal(size=(19, 3))
+    sights = SightLines(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+    assert surface_of(points, np.tile(np.eye(3), (19, 1, 1)), sights) is None

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import cache
 
 import numpy as np
 import pytest
+from chaserdock_agents.mapper.docking_site import SiteLimits, judged_site, site_on_ray
 from chaserdock_agents.mapper.surface import MappedSurface, SightLines, surface_of
 from chaserdock_models.arrays import Array
 
@@ -87,10 +89,10 @@ def around(count: int, height: float = 0.0) -> Array:
 EVERYWHERE = np.concatenate([around(12), around(8, 1.6), around(8, -1.6)])
 
 
-def sampled(surface: MappedSurface, keep: Array | None = None) -> Array:
+def sampled(surface: MappedSurface) -> Array:
     """Return points on the triangles of a surface, weighted by their areas."""
     rng = np.random.default_rng(9)
-    triangles = surface.triangles if keep is None else surface.triangles[keep]
+    triangles = surface.triangles
     a, b, c = (surface.vertices_m[triangles[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     at = rng.choice(len(triangles), 4000, p=area / area.sum())
@@ -145,3 +147,76 @@ def test_too_few_landmarks_are_no_surface() -> None:
     points = np.random.default_rng(0).normal(size=(19, 3))
     sights = SightLines(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
     assert surface_of(points, np.tile(np.eye(3), (19, 1, 1)), sights) is None
+
+
+# -- places to dock --------------------------------------------------------------------------------
+
+
+@cache
+def the_map() -> tuple[MappedSurface, Array, Array]:
+    """Return a surface of the boxes, and the landmarks of all their sides with covariances."""
+    surface, _ = mapped(1, EVERYWHERE)
+    rng = np.random.default_rng(5)
+    points = points_on_boxes(rng, 300)
+    landmarks = points + SIGMA_M * rng.normal(size=points.shape)
+    return surface, landmarks, np.tile(SIGMA_M**2 * np.eye(3), (len(landmarks), 1, 1))
+
+
+LIMITS = SiteLimits(corridor_m=0.5, radius_m=0.1, reach_m=0.2)
+
+
+def test_a_line_of_sight_finds_a_flat_place_with_its_normal() -> None:
+    surface, landmarks, covariances = the_map()
+    camera = np.array([1.9, -0.3, 0.4])
+    place = np.array([0.3, -0.03, 0.04])
+    site = site_on_ray(camera, place - camera, surface, landmarks, covariances, LIMITS)
+    assert site is not None
+    assert site.why_not == ()
+    assert np.linalg.norm(site.position_m - place) < 0.02
+    assert abs(site.position_m[0] - 0.3) < 4.0 * site.sigma_m
+    assert np.arccos(site.normal[0]) < 4.0 * site.normal_sigma_rad
+    assert site.sigma_m < SIGMA_M
+    away = site_on_ray(camera, camera - place, surface, landmarks, covariances, LIMITS)
+    assert away is None
+
+
+def test_the_accuracy_of_a_normal_is_what_it_is_said_to_be() -> None:
+    rng = np.random.default_rng(7)
+    surface = the_map()[0]
+    turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turned[:, 2] *= np.sign(np.linalg.det(turned))
+    squares = []
+    for _ in range(200):
+        flat = rng.uniform(-0.1, 0.1, (15, 3)) * [1.0, 0.6, 0.0]
+        points = flat @ turned.T + SIGMA_M * rng.normal(size=(15, 3))
+        covariances = np.tile(SIGMA_M**2 * np.eye(3), (15, 1, 1))
+        site = judged_site(np.zeros(3), turned[:, 2], surface, points, covariances, LIMITS)
+        about = np.cross(site.normal, turned[:, 2]) @ turned[:, 0]  # the less certain axis
+        squares.append((about / site.normal_sigma_rad) ** 2)
+    assert 0.5 < np.mean(squares) < 1.3
+
+
+@pytest.mark.parametrize(
+    ("at", "outward", "reason"),
+    [
+        ((0.0, 0.2, 0.0), (0.0, 1.0, 0.0), "within the corridor"),  # the panel is in the way
+        ((0.3, 0.2, 0.0), (1.0, 1.0, 0.0), "not flat"),  # an edge
+        ((0.0, -1.0, 0.0), (0.0, -1.0, 0.0), "landmarks within"),
+    ],
+)
+def test_a_bad_place_states_why(
+    at: tuple[float, ...], outward: tuple[float, ...], reason: str
+) -> None:
+    surface, landmarks, covariances = the_map()
+    place, direction = np.array(at), np.array(outward)
+    site = judged_site(place, direction, surface, landmarks, covariances, LIMITS)
+    assert any(reason in why for why in site.why_not), site.why_not
+
+
+def test_an_unseen_place_and_an_uncertain_normal_state_why() -> None:
+    surface, landmarks, covariances = the_map()
+    at, outward = np.array([0.3, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
+    unseen = judged_site(at, outward, surface, landmarks, covariances, LIMITS, seen=False)
+    assert unseen.why_not == ("no camera has seen it from outside",)
+    vague = judged_site(at, outward, surface, landmarks[::4], 100.0 * covariances[::4], LIMITS)
+    assert any("normal known to" in why for why in vague.why_not)

@@ -74,14 +74,14 @@ def surface_of(
     if len(landmarks_m) < _LEAST_LANDMARKS:
         return None
     tetrahedra = Delaunay(landmarks_m).simplices.astype(np.int64)
-    faces, owners = _faces(tetrahedra)
+    faces, owners = _sides(tetrahedra)
     crossings = np.zeros(len(tetrahedra), dtype=np.int64)
     ends, starts = _shortened(landmarks_m, covariances_m2, sights)
     corners = landmarks_m[faces]
     for landmark in np.unique(sights.landmarks):
         of_it = np.flatnonzero(sights.landmarks == landmark)
-        crosses = [_crosses(starts[k], ends[k], corners) for k in of_it]
-        crossed = np.unique(owners[np.any(crosses, axis=0)])
+        met = [met_triangles(starts[k], ends[k] - starts[k], corners) for k in of_it]
+        crossed = np.unique(owners[np.concatenate([faces[t <= 1.0] for faces, t in met])])
         crossings[crossed[crossed >= 0]] += 1
     solid = crossings < _LEAST_CROSSINGS
     triangles = _boundary(landmarks_m, tetrahedra, faces, owners, solid)
@@ -97,7 +97,7 @@ def surface_of(
     return MappedSurface(bare.vertices_m, triangles_used, seen, sigma)
 
 
-def _faces(tetrahedra: IntArray) -> tuple[IntArray, IntArray]:
+def _sides(tetrahedra: IntArray) -> tuple[IntArray, IntArray]:
     """Return each face once, (f, 3), and the tetrahedra beside it, (f, 2), -1 for none."""
     sides = np.sort(
         tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1
@@ -126,24 +126,24 @@ def _shortened(
     return at + short_m[:, None] * towards, sights.cameras_m
 
 
-def _crosses(start: Array, end: Array, corners: Array) -> NDArray[np.bool_]:
-    """Return whether the segment between two points crosses each triangle (f, 3, 3).
+def met_triangles(origin_m: Array, direction: Array, corners: Array) -> tuple[IntArray, Array]:
+    """Return which triangles (f, 3, 3) a ray meets, (k,), and at which multiples of ``direction``
+    (3,), not negative, (k,).
 
     Source: T. Moeller and B. Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
     """
     a = corners[:, 0]
     along_b, along_c = corners[:, 1] - a, corners[:, 2] - a
-    direction = end - start
     across = np.cross(direction, along_c)
-    scale = np.einsum("ij,ij->i", along_b, across)
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / scale
-        off = start - a
+        inverse = 1.0 / np.einsum("ij,ij->i", along_b, across)
+        off = origin_m - a
         u = np.einsum("ij,ij->i", off, across) * inverse
         turned = np.cross(off, along_b)
         v = turned @ direction * inverse
         t = np.einsum("ij,ij->i", along_c, turned) * inverse
-        return (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t >= 0.0) & (t <= 1.0)
+        met = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t >= 0.0)
+    return np.flatnonzero(met), t[met]
 
 
 def _boundary(

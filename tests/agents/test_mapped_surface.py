@@ -30,7 +30,7 @@ def points_on_boxes(rng: np.random.Generator, count: int) -> Array:
                 p[: count // 4] = np.sign(p[: count // 4])
                 p[:, axis] = side
                 out.append(centre + p * half)
-    return np.unique(np.round(np.concatenate(out), 6), axis=0)
+    return np.unique(np.concatenate(out).astype(float), axis=0)
 
 
 def distance_outside(points: Array) -> Array:

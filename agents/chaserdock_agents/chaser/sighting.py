@@ -6,7 +6,7 @@ A pure function of image, prediction and parameters.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -111,15 +111,17 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
         sighting = _measure(perception, pixels, image.ranging, predicted, header)
         codec.decode(Sighting, codec.encode(sighting))  # raises what a reader would refuse
     except (BadImage, UnusableImage) as error:
-        return Sighting(**header, status="bad_image", **_EMPTY, detail=str(error)[:LONGEST_TEXT])
+        return without_sighting(image, str(error), "bad_image")
     except Exception as error:  # an installed perception may raise or return anything
         raise PerceptionFailed(text_of(error)) from error
     return sighting
 
 
-def without_sighting(image: Image, reason: str) -> Sighting:
-    """Return the sighting of an image in which perception failed."""
-    return Sighting(**_header(image), status="nothing", **_EMPTY, detail=reason)
+def without_sighting(
+    image: Image, reason: str, status: Literal["nothing", "bad_image"] = "nothing"
+) -> Sighting:
+    """Return the sighting of an image that shows no pose, and why."""
+    return Sighting(**_header(image), status=status, **_EMPTY, detail=reason[:LONGEST_TEXT])
 
 
 _EMPTY: dict[str, Any] = {"solutions": (), "marker_ids": (), "corners_px": (), "rejected_ids": ()}

@@ -134,7 +134,8 @@ class ChaserMachine:
         self.nominal_m = np.asarray(scenario.chasers[number].position_m)
         self.dock, self._cone = dock_of(scenario, number), cone_of(scenario, number)
         self.thrusters = ThrusterCommands(scenario.chaser)
-        self.state = ChaserGuidance(Phase.ACQUIRE, 0.0, stay(self.nominal_m, 0.0))
+        first = Phase.SURVEY if scenario.maps_target else Phase.ACQUIRE
+        self.state = ChaserGuidance(first, 0.0, stay(self.nominal_m, 0.0))
         self.position_m: Array | None = None
         self.seen: DockingObservation | None = None
         self.relative: RelativeState | None = None
@@ -239,6 +240,8 @@ class ChaserMachine:
         """
         if self.phase in (Phase.ACQUIRE, Phase.SEARCHING):
             return CommandResult(False, "the target has not been found yet")
+        if self.phase is Phase.SURVEY and self.position_m is None:
+            return CommandResult(False, "there is no map of the target yet (event of the mapper)")
         done_s, done = self._last_command or (-math.inf, command)
         differs = (done.command, done.offset_m) != (command.command, command.offset_m)
         if done_s == now_s and differs and command.command != "abort":

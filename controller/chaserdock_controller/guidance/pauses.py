@@ -34,7 +34,7 @@ def resume_after_pause(
     lifetime_s = chaser.scenario.controller.command_lifetime_s
     if led_s is None or now_s - led_s <= lifetime_s or known.offset_m is None:
         return
-    if chaser.phase in (Phase.ACQUIRE, Phase.SEARCHING):
+    if chaser.phase in (Phase.ACQUIRE, Phase.SEARCHING, Phase.SURVEY):
         return  # they have no motion, and search without a known place
     chaser.position_m, chaser.seen, chaser.relative = known.offset_m, known.port, known.relative
     since_s = now_s - max(0.0, led_s - chaser.state.since_s)

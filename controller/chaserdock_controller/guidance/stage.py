@@ -37,6 +37,9 @@ from .horizon import ReferenceBuilder
 from .pauses import resume_after_pause
 from .phases import Phase
 
+_UNLED = (Phase.SEARCHING, Phase.SURVEY)
+"""Phases of chasers that do not fly relative to the target, by commands of their own."""
+
 
 class GuidanceStage:
     """Runs the state machines of the chasers and their activities."""
@@ -200,7 +203,7 @@ class GuidanceStage:
     ) -> HorizonReference | None:
         """Return the references of the chasers that are planned for; None if there are none."""
         present = [(c, tick) for c, tick in zip(self.chasers, known, strict=True) if tick.own]
-        planned = [c for c, _ in present if c.phase is not Phase.SEARCHING]
+        planned = [c for c, _ in present if c.phase not in _UNLED]
         attached = frozenset(c.number for c, tick in present if c.is_attached(tick))
         # Latched chasers are planned for only while others have to fly around them.
         if estimation.at_effect is None or not planned or len(attached) == len(present):

@@ -191,6 +191,7 @@ class ChaserCore:
             self._publish_sighting(self.outbox, no_image)
         elif topic is topics.ODOMETRY and inbox.odometry is not None:
             if self._is_new(inbox.extrapolate_odometry(lost)):
+                self.vision.take(inbox.odometry)
                 self._continue_tick(inbox.odometry)
         elif topic is topics.DOCKING and inbox.assume_docking(lost, self.number):
             self._observe_thrusters()

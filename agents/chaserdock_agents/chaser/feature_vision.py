@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Look at a target of unknown shape: follow its points for the mapper. No I/O.
+"""Look at a target of unknown shape: follow its points for the mapper, measure its pose by the map.
+No I/O.
 
 What the mapper knows comes back in its maps, by which points are found again when a face returns.
 In lock-step a map counts from a fixed age on, so that equal flights use equal maps.
@@ -8,7 +9,7 @@ In lock-step a map counts from a fixed age on, so that equal flights use equal m
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import msgspec
@@ -37,12 +38,15 @@ from numpy.typing import ArrayLike
 from .perception.features import (
     FeatureTracker,
     KnownTarget,
+    NoMapPose,
     PointDescriptions,
+    SeenLandmarks,
     TrackedPoints,
     describe,
+    pose_by_map,
 )
 from .perception.refine import PoseInCamera
-from .sighting import BadImage, decode_image, without_sighting
+from .sighting import BadImage, decode_image, pose_solution, without_sighting
 from .vision import REMEMBERED_IMAGES, Vision
 
 _DESCRIBED_PERIOD_S = 5.2
@@ -65,21 +69,35 @@ class MappedPath:
         attitudes = rotations.to_matrix(rotations.multiply(m.q_wxyz, turns))
         return np.array(m.position_m) + np.array(m.velocity_m_s) * after, attitudes
 
+    def covariance_at(self, time_s: float) -> Array:
+        """Return the covariance (6, 6) of position, WRF, and dtheta, TRF, at a time."""
+        by = np.zeros((6, 12))
+        by[:3, :3] = by[3:, 6:9] = np.eye(3)
+        by[:3, 3:6] = by[3:, 9:] = (time_s - self.time_s) * np.eye(3)
+        return by @ np.array(self.motion.covariance).reshape(12, 12) @ by.T
+
 
 @dataclass(frozen=True, eq=False)
 class CountingMap:
-    """A map that counts, and what it says of one chaser's points: None without landmarks."""
+    """A map that counts, and what it says of one chaser's points: None without landmarks.
+
+    ``covariances_m2`` (n, 3, 3): of the known landmarks, TRF.
+    """
 
     message: LandmarkMap
-    known: KnownTarget | None
+    known: KnownTarget | None = None
+    path: MappedPath | None = None
+    covariances_m2: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
 
 class FeatureVision(Vision):
-    """Follow points of the target in the images of chaser ``chaser``."""
+    """Follow points of the target in the images of chaser ``chaser``, and measure its pose once
+    there is a map with distances.
+    """
 
     def __init__(self, scenario: FlightScenario, chaser: int) -> None:
         super().__init__(None)
-        timing = scenario.timing
+        timing, self._errors = scenario.timing, scenario.navigation.errors()
         self._chaser, self._camera = chaser, scenario.camera_model()
         self._tracker = FeatureTracker(self._camera)
         self._latency_ticks = round(scenario.mapping.latency_s * timing.rate_hz)
@@ -111,11 +129,14 @@ class FeatureVision(Vision):
 
     def without_image(self, missed: Sighting) -> None:
         """Let the mapper not wait for the points of an image that will not come."""
-        self.tracks = self._tracks(missed, "bad_image", *self._camera_pose(missed.sim_time_ns))
+        pose = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+        if self._odometry:
+            pose = self._camera_pose(missed.sim_time_ns)
+        self.tracks = self._tracks(missed, "bad_image", *pose)
 
     def look(self, image: Image) -> Sighting | None:
-        """Follow the points into an image. Return a sighting without a pose; None if the image of
-        its exposure was processed before.
+        """Follow the points into an image. Return a sighting, without a pose while there is no map;
+        None if the image of its exposure was processed before.
         """
         with self._looking:
             exposure = (image.tick, image.sim_time_ns)
@@ -148,7 +169,57 @@ class FeatureVision(Vision):
         self.tracks = self._tracks(
             image, "seen" if len(seen.ids) else "nothing", *pose, seen, described
         )
-        return without_sighting(image, "no map of the target yet" if known is None else "")
+        return self._sighting_by(counting, image, seen, pose)
+
+    def _sighting_by(
+        self,
+        counting: CountingMap | None,
+        image: Image,
+        seen: TrackedPoints,
+        camera_pose: tuple[Array, Array],
+    ) -> Sighting:
+        """Return the pose of the target by a map, or why there is none."""
+        if counting is None or counting.known is None or counting.path is None:
+            status = "gathering" if counting is None else counting.message.status
+            return without_sighting(image, f"no map of the target: {status}")
+        if counting.message.status != "mapped":
+            return without_sighting(image, f"no distances in the map: {counting.message.status}")
+        time_s, known = image.sim_time_ns / 1e9, counting.known
+        axes = rotations.to_matrix(camera_pose[1])
+        at, turned = counting.path.at([time_s])
+        predicted = PoseInCamera(axes.T @ (at[0] - camera_pose[0]), axes.T @ turned[0])
+        _, mine, theirs = np.intersect1d(
+            seen.ids, known.ids, assume_unique=True, return_indices=True
+        )
+        landmarks = SeenLandmarks(
+            seen.px[mine],
+            seen.ages_s[mine],
+            known.landmarks_m[theirs],
+            counting.covariances_m2[theirs],
+        )
+        covariance = self._in_camera(counting.path.covariance_at(time_s), axes, predicted)
+        try:
+            pose = pose_by_map(self._camera, landmarks, predicted, covariance)
+        except NoMapPose as error:
+            return without_sighting(image, str(error))
+        return msgspec.structs.replace(
+            without_sighting(image, ""), status="seen", solutions=(pose_solution(pose),)
+        )
+
+    def _in_camera(self, covariance: Array, axes: Array, pose: PoseInCamera) -> Array:
+        """Return the covariance (6, 6) of a pose in the camera from that in WRF; adds the errors of
+        odometry and mounting. ``axes`` (3, 3): IRF to WRF.
+        """
+        e = self._errors
+        turn_rad = float(np.hypot(e.camera_turn_rad, e.attitude_noise_rad))
+        shift_m = float(np.hypot(e.camera_shift_m, e.position_noise_m))
+        to_irf = np.eye(6)
+        to_irf[:3, :3] = axes.T
+        out = to_irf @ covariance @ to_irf.T
+        range_m = float(np.linalg.norm(pose.position))
+        out[:3, :3] += np.eye(3) * (shift_m**2 + (turn_rad * range_m) ** 2)
+        out[3:, 3:] += np.eye(3) * turn_rad**2
+        return out
 
     def _camera_pose(self, time_ns: int) -> tuple[Array, Array]:
         """Return optical centre (3,) and attitude (4,), IRF to WRF, by odometry at a time."""
@@ -162,21 +233,25 @@ class FeatureVision(Vision):
         """Return the newest map that counts at a tick; None before the first one."""
         arrived = [m for m in tuple(self._maps) if m.tick + self._latency_ticks <= tick]
         if arrived and (self._counting is None or self._counting.message is not arrived[-1]):
-            self._counting = CountingMap(arrived[-1], self._known(arrived[-1]))
+            self._counting = self._read(arrived[-1])
         return self._counting
 
-    def _known(self, message: LandmarkMap) -> KnownTarget | None:
+    def _read(self, message: LandmarkMap) -> CountingMap:
         own = next((t for t in message.tracks if t.chaser == self._chaser), None)
-        landmarks = np.array(message.landmarks_m).reshape(-1, 3)
         if message.motion is None or own is None or self._first_id is None:
-            return None
-        rows = np.array(own.landmarks, dtype=np.int64)
-        if len(rows) != len(own.ids) or (len(rows) and rows.max() >= len(landmarks)):
-            return None
+            return CountingMap(message)
+        landmarks = np.array(message.landmarks_m).reshape(-1, 3)
+        moments = np.array(message.moments_m2).reshape(-1, 6)
+        rows, n = np.array(own.landmarks, dtype=np.int64), len(landmarks)
+        if len(rows) != len(own.ids) or len(moments) != n or (rows >= n).any():
+            return CountingMap(message)
         path = MappedPath(message.sim_time_ns / 1e9, message.motion)
         ids = np.array(own.ids, dtype=np.int64) - self._first_id
         mine = ids >= 0
-        return KnownTarget(path, ids[mine], landmarks[rows[mine]])
+        rows = rows[mine]
+        known = KnownTarget(path, ids[mine], landmarks[rows])
+        spread = moments[rows][:, (0, 3, 4, 3, 1, 5, 4, 5, 2)].reshape(-1, 3, 3)
+        return CountingMap(message, known, path, spread)
 
     def _tracks(
         self,

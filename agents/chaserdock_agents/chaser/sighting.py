@@ -142,7 +142,7 @@ def _measure(
     seen = perception.estimate(pixels, predicted)
     if not hasattr(seen, "solutions"):
         raise TypeError(f"estimate() returned {type(seen).__name__}, not a PerceptionResult")
-    solutions, detail = tuple(_solution(pose) for pose in seen.solutions), ""
+    solutions, detail = tuple(pose_solution(pose) for pose in seen.solutions), ""
     rejected = tuple(int(i) for i in seen.rejected_ids)
     if ranging is not None and isinstance(perception, FarPerception):
         try:
@@ -183,7 +183,8 @@ def _variance(pose: PoseSolution) -> float:
     return pose.covariance[0] + pose.covariance[7] + pose.covariance[14]
 
 
-def _solution(pose: TargetPose) -> PoseSolution:
+def pose_solution(pose: TargetPose) -> PoseSolution:
+    """Convert a pose of the target to its part of a message."""
     return PoseSolution(
         position_m=vector(pose.position_irf_m),
         q_wxyz=vector(pose.q_irf_trf_wxyz),
@@ -202,7 +203,7 @@ def _by_bearing(
     target = RangedTarget(
         measured.range_m, measured.range_sigma_m, np.array(measured.q_wxyz), covariance
     )
-    return _solution(finder.find(pixels, target, None if predicted is None else predicted[0]))
+    return pose_solution(finder.find(pixels, target, None if predicted is None else predicted[0]))
 
 
 def geometry_message(found: GeometryInformation) -> GeometryMeasurement:

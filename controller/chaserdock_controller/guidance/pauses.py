@@ -53,6 +53,18 @@ def resume_after_pause(
     chaser.state = replace(chaser.state, slew=turn_back)
 
 
+def lead_from_here(
+    chaser: ChaserMachine, known: ChaserTick, moves: MovePlanner, references: ReferenceBuilder
+) -> None:
+    """Let the motion of a chaser that is not led relative to the target begin where it is and
+    where it points. Call in every tick in which its pose is known.
+    """
+    assert known.offset_m is not None
+    chaser.state = replace(chaser.state, move=stay(known.offset_m, known.now_s), slew=None)
+    turn = _turn_back(chaser, known, moves.goto_m_s, references)
+    chaser.state = replace(chaser.state, slew=turn)
+
+
 def _again(chaser: ChaserMachine, move: Motion, now_s: float, moves: MovePlanner) -> Motion | None:
     """Return the rest of a ``move`` for a chaser that rests where it is; None for a way into a
     port, which can only begin at the corridor's entry.

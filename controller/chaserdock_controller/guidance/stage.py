@@ -34,7 +34,7 @@ from .docking import DockingObservation
 from .escape import RelativeState
 from .fleet import ChaserFleet
 from .horizon import ReferenceBuilder
-from .pauses import resume_after_pause
+from .pauses import lead_from_here, resume_after_pause
 from .phases import Phase
 
 _UNLED = (Phase.SEARCHING, Phase.SURVEY)
@@ -192,6 +192,8 @@ class GuidanceStage:
         """Advance a chaser's phase by its tracking errors and its docking sensor. Returns its
         reference at the start of the tick.
         """
+        if chaser.phase is Phase.SURVEY:
+            lead_from_here(chaser, known, self.fleet.moves, self.references)
         pose = self.references.pose(chaser, known.target, known.now_s)
         error_m = length(pose[0] - own.position_m)
         error_rad = float(rotations.angle_between(pose[1], own.q_wxyz))

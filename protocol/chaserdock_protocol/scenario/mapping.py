@@ -7,9 +7,22 @@ from typing import Annotated
 
 from pydantic import Field
 
-from .fields import Section
+from .fields import Positive, Section
 
 Seconds = Annotated[float, Field(ge=0.2, le=60, allow_inf_nan=False)]
+
+
+class MapLimits(Section):
+    """What the mapper must achieve with a target of unknown shape; the last map must have
+    distances.
+    """
+
+    within_s: Positive = Field(
+        default=15.0, description="Time of the images of the first map at the latest, s."
+    )
+    rate_percent: Positive = Field(
+        default=1.0, description="Largest error of the rate vector of the last map, %."
+    )
 
 
 class Mapping(Section):

@@ -250,8 +250,8 @@ class FeatureVision(Vision):
         mine = ids >= 0
         rows = rows[mine]
         known = KnownTarget(path, ids[mine], landmarks[rows])
-        spread = moments[rows][:, (0, 3, 4, 3, 1, 5, 4, 5, 2)].reshape(-1, 3, 3)
-        return CountingMap(message, known, path, spread)
+        spread = moments[:, (0, 3, 4, 3, 1, 5, 4, 5, 2)].reshape(-1, 3, 3)
+        return CountingMap(message, known, path, _without_common(spread)[rows])
 
     def _tracks(
         self,
@@ -281,3 +281,14 @@ class FeatureVision(Vision):
             described=() if described is None else tuple((described.ids + first).tolist()),
             descriptions=b"" if described is None else described.values.tobytes(),
         )
+
+
+def _without_common(covariances_m2: Array) -> Array:
+    """Return covariances (n, 3, 3) of landmarks without what all have in common: where the frame
+    is on the target. It is at most that of the most certain one.
+    """
+    if not len(covariances_m2):
+        return covariances_m2
+    least = covariances_m2[np.argmin(np.trace(covariances_m2, axis1=1, axis2=2))]
+    values, vectors = np.linalg.eigh(covariances_m2 - least)
+    return (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)

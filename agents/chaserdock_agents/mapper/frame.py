@@ -64,7 +64,7 @@ class MapFrame:
         """Set turn and origin so that places ``now`` come to lie on those ``before`` (k, 3), least
         squares (Umeyama 1991, without scale).
         """
-        middle, target = np.median(now, axis=0), np.median(before, axis=0)
+        middle, target = now.mean(axis=0), before.mean(axis=0)
         u, _, v = np.linalg.svd((before - target).T @ (now - middle))
         self.turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
         self.origin_m = _on_axis(middle - self.turn.T @ target, omega_rad_s)

@@ -120,7 +120,8 @@ TRANSITIONS = (
     Transition((_P.CALIBRATE,), _T.CALIBRATION_COMPLETE, _P.HOLD),
     Transition((_P.HOLD,), _T.COMMAND_INSPECT, _P.INSPECT),
     Transition((_P.INSPECT,), _T.INSPECTION_COMPLETE, _P.HOLD),
-    Transition((*_FREE, _P.SURVEY), _T.COMMAND_GOTO, _P.GOTO),
+    Transition(_FREE, _T.COMMAND_GOTO, _P.GOTO),
+    Transition((_P.SURVEY,), _T.COMMAND_GOTO, _P.GOTO, by_capture=False),
     Transition((_P.APPROACH, _P.DOCKED), _T.COMMAND_GOTO, _P.GOTO, by_capture=False),
     Transition((_P.WAIT, _P.ALIGN), _T.COMMAND_GOTO, _P.GOTO, by_capture=True),
     Transition(

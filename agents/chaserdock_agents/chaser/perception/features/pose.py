@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the pose of a mapped target by the landmarks that an image shows.
+"""Measure the pose of a mapped target by its predicted motion and the landmarks in an image.
 
-Starts from the pose that the map's motion predicts. Errors of the landmarks count by their
-covariance: each alone in its weight, and their common part, which no number of points averages out,
-in the covariance of the pose.
+The landmarks must confirm the prediction, else there is no pose. The pose is the mean of both by
+their covariances: points slide alike with shading and edges, so that a good map predicts better
+than one image shows, and an old one does not.
 """
 
 from __future__ import annotations
@@ -32,24 +32,27 @@ class MapPoseTuning:
     """Points that err together, as neighbours slide alike: the covariance counts so many as
     one."""
     gate_sigmas: float = 3.0
-    """Points farther from the adjusted pose are not used."""
+    """Points farther from the adjusted pose are not used; the gate of poses is as wide beyond
+    ``gate_rad`` and ``gate_share``."""
     least_points: int = 20
     """Used points of a pose: less than a tenth of those usually in view."""
     least_share: float = 0.5
     """Share of the known points that must fit; of a wrong pose, few do."""
     gate_rad: float = 0.035
-    """Largest difference from the predicted attitude, 2 degrees, beyond four standard deviations
-    of the prediction."""
+    """Largest difference from the predicted attitude, 2 degrees, beyond its standard deviations."""
     gate_share: float = 0.02
     """The same for the position, as a share of the range."""
+    same_images: float = 60.0
+    """Images, of all chasers, whose poses err alike because one map predicts them: those of 6 s at
+    five a second by two. The covariance is larger by this factor, so that as many are worth one."""
     steps: int = 8
     """Gauss-Newton steps, of which four are needed from 3 degrees off."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenLandmarks:
-    """Landmarks of an image: ideal pixels (n, 2), ages (n,), s, places (n, 3) and covariances (n,
-    3, 3), TRF.
+    """Landmarks of an image: ideal pixels (n, 2), ages (n,), s, places (n, 3), TRF, and covariances
+    (n, 3, 3) of these without what all have in common, which is no error of a pose.
     """
 
     px: Array
@@ -70,7 +73,7 @@ def pose_by_map(
     tuning: MapPoseTuning | None = None,
 ) -> TargetPose:
     """Return the pose of the target. ``covariance`` (6, 6): of the predicted pose, position in IRF
-    axes and dtheta in TRF axes.
+    axes and dtheta in TRF axes, positive definite.
 
     Raises NoMapPose if too few points fit, or the pose is too far from the predicted one.
     """
@@ -93,11 +96,16 @@ def pose_by_map(
     if used < max(tuning.least_points, tuning.least_share * count):
         raise NoMapPose(f"{used} of {count} points fit the map")
     information = np.einsum("nki,nkj,n->ij", by_pose[fits], by_pose[fits], 1.0 / sigma[fits] ** 2)
-    own = tuning.alike * np.linalg.inv(information) + _common(seen, fits, pose)
-    _check_gate(pose, predicted, own + covariance, tuning)
-    rms = float(np.sqrt((residual[fits] ** 2).sum(axis=1).mean()))
-    q = rotations.normalize(rotations.from_matrix(pose.rotation))
-    return TargetPose(pose.position, q, own, rms)
+    rms_px = float(np.sqrt((residual[fits] ** 2).sum(axis=1).mean()))
+    shown = tuning.alike * np.linalg.inv(information)
+    shown += _slid_alike(camera, seen.landmarks_m[fits], pose, rms_px)
+    apart = _apart(pose, predicted)
+    _check_gate(apart, float(np.linalg.norm(predicted.position)), shown + covariance, tuning)
+    gain = covariance @ np.linalg.inv(shown + covariance)
+    fused = _moved(predicted, gain @ apart)
+    left = covariance - gain @ covariance
+    q = rotations.normalize(rotations.from_matrix(fused.rotation))
+    return TargetPose(fused.position, q, tuning.same_images * 0.5 * (left + left.T), rms_px)
 
 
 _SMALL_STEP = 1e-6
@@ -145,30 +153,28 @@ def _moved(pose: PoseInCamera, step: Array) -> PoseInCamera:
     return PoseInCamera(pose.position + step[:3], pose.rotation @ turn)
 
 
-def _common(seen: SeenLandmarks, fits: Array, pose: PoseInCamera) -> Array:
-    """Return the covariance (6, 6) of a pose if all landmarks of a side err together by theirs: as
-    a shift, and as a turn that moves them by as much at their distance from the origin.
+def _slid_alike(camera: Camera, landmarks_m: Array, pose: PoseInCamera, slide_px: float) -> Array:
+    """Return the covariance (6, 6) of a pose if all points have slid alike by ``slide_px``: as a
+    shift, and as a turn that moves the landmarks by as much.
     """
-    mean = seen.covariances_m2[fits].mean(axis=0)
-    radius_m2 = float((seen.landmarks_m[fits] ** 2).sum(axis=1).mean())
-    out = np.zeros((6, 6))
-    out[:3, :3] = pose.rotation @ mean @ pose.rotation.T
-    out[3:, 3:] = np.eye(3) * float(np.trace(mean)) / 3.0 / radius_m2
-    return out
+    shift_m = slide_px * float(pose.position[2]) / camera.fx_px
+    radius_m = float(np.sqrt(landmarks_m.var(axis=0).sum()))
+    return np.diag([shift_m**2] * 3 + [(shift_m / radius_m) ** 2] * 3)
 
 
-def _check_gate(
-    pose: PoseInCamera, predicted: PoseInCamera, covariance: Array, tuning: MapPoseTuning
-) -> None:
-    """Raise NoMapPose for a pose too far from the predicted one."""
-    apart_m = float(np.linalg.norm(pose.position - predicted.position))
+def _apart(pose: PoseInCamera, predicted: PoseInCamera) -> Array:
+    """Return position and dtheta (6,) of a pose from the predicted one."""
     turn = rotations.log(rotations.from_matrix(predicted.rotation.T @ pose.rotation))
-    apart_rad = float(np.linalg.norm(turn))
+    return np.concatenate([pose.position - predicted.position, turn])
+
+
+def _check_gate(apart: Array, range_m: float, covariance: Array, tuning: MapPoseTuning) -> None:
+    """Raise NoMapPose for a pose too far from the predicted one, by ``apart`` (6,)."""
+    apart_m, apart_rad = float(np.linalg.norm(apart[:3])), float(np.linalg.norm(apart[3:]))
     sigma_m, sigma_rad = (
         float(np.sqrt(np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1])) for k in (0, 3)
     )
-    range_m = float(np.linalg.norm(predicted.position))
-    if apart_m > tuning.gate_share * range_m + 4.0 * sigma_m:
+    if apart_m > tuning.gate_share * range_m + tuning.gate_sigmas * sigma_m:
         raise NoMapPose(f"{1e3 * apart_m:.0f} mm from the predicted position")
-    if apart_rad > tuning.gate_rad + 4.0 * sigma_rad:
+    if apart_rad > tuning.gate_rad + tuning.gate_sigmas * sigma_rad:
         raise NoMapPose(f"{np.degrees(apart_rad):.1f} degrees from the predicted attitude")

@@ -64,6 +64,8 @@ def test_there_is_a_sample_of_every_message() -> None:
         m.GeometryEstimate,
         m.GeometryMeasurement,
         m.Innovation,
+        m.KnownTracks,
+        m.MappedMotion,
         m.MassEstimate,
         m.PoseSolution,
         m.ProbeTouch,

@@ -79,6 +79,8 @@ class GuidanceStage:
         for chaser, tick in ticks:
             chaser.follow_planning(tick)
 
+        for sighting in observation.sightings:
+            fleet.chasers[sighting.chaser].unseen = sighting.detail
         commands = (*fleet.due_commands(now_s), *observation.commands)
         for activity in self.activities:
             activity.observe(commands, observation, estimation)

@@ -332,6 +332,8 @@ def _check_unknown_target(scenario: FlightScenario) -> None:
         raise ValueError('target.motion: perception.name = "features" maps constant rates only')
     if scenario.docking.kind == "capture":
         raise ValueError('docking.kind: "capture" needs the shape of the target at its ports')
+    if scenario.mapping.latency_s * scenario.time.image_hz < 1.0 - 1e-9:
+        raise ValueError("mapping.latency_s: shorter than the interval of the images")
     if scenario.limits.min_distance_shape_m:
         raise ValueError("limits.min_distance_shape_m: the shape of the target is unknown")
 

@@ -42,9 +42,10 @@ class MapPoseTuning:
     """Largest difference from the predicted attitude, 2 degrees, beyond its standard deviations."""
     gate_share: float = 0.02
     """The same for the position, as a share of the range."""
-    same_images: float = 60.0
-    """Images, of all chasers, whose poses err alike because one map predicts them: those of 6 s at
-    five a second by two. The covariance is larger by this factor, so that as many are worth one."""
+    same_images: float = 12.0
+    """Images whose poses err alike, because one map predicts them: the covariance is larger by this
+    factor, so that as many are worth one. 60 are of one map; with so many, a new map took the
+    filter half a minute (NEES: docs/unknown-target.md)."""
     steps: int = 8
     """Gauss-Newton steps, of which four are needed from 3 degrees off."""
 

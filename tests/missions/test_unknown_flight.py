@@ -22,6 +22,7 @@ from source_tree import ROOT
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summary_of
 from chaserdock.simulation.mission import SimulatedFlight, simulate
+from chaserdock.summary import Summary
 
 PATH = ROOT / "scenarios/unknown-inspection.toml"
 SHORTER = ("duration_s=14.0", "settling_s=11.0")
@@ -71,6 +72,7 @@ def test_messages_of_the_mapper_are_bounded(flight: SimulatedFlight) -> None:
 @pytest.mark.slow(0.1)
 def test_its_figures_are_judged(flight: SimulatedFlight) -> None:
     result = summary_of(load_flight(flight.folder))
+    assert Summary.from_dict(result).mapping is not None
     mapping = result["mapping"]
     assert mapping["status"] == "mapped"
     assert 0.0 < mapping["rate_error_share"] < 0.05

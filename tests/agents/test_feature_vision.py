@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from chaser_cases import deliver, lost, odometry, tick_of
 from chaserdock_agents.chaser.core import ChaserCore
-from chaserdock_agents.chaser.feature_vision import FeatureVision, MappedPath
+from chaserdock_agents.chaser.feature_vision import FeatureVision, MappedPath, probe_discs
 from chaserdock_agents.chaser.perception.features import (
     MapPoseTuning,
     NoMapPose,
@@ -22,6 +22,7 @@ from chaserdock_agents.chaser.perception.refine import PoseInCamera
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     FeatureTracks,
@@ -265,3 +266,15 @@ def test_a_mapped_path_is_that_of_constant_rates() -> None:
         then[:3, :3],
         full[:3, :3] + 3.0 * (full[:3, 3:6] + full[3:6, :3]) + 9.0 * full[3:6, 3:6],
     )
+
+
+def test_the_own_probe_is_left_out_of_the_points() -> None:
+    wide = {"camera": {"width_px": 960, "height_px": 540}}
+    scenario = flight_scenario(parse_scenario(CASE | wide, "unknown"))
+    camera, (_, probe) = scenario.camera_model(), scenario.chaser.boxes()
+    discs = np.array(probe_discs(camera, probe))
+    corners = cuboid_corners(probe.size_m) + probe.position_m
+    at = rotations.rotate_inverse(camera.q_crf_irf_wxyz, corners - np.array(camera.position_crf_m))
+    for px in camera.project(at[at[:, 2] > 0.02]):
+        assert (np.linalg.norm(discs[:, :2] - px, axis=1) < discs[:, 2]).any()
+    assert (discs[:, 1] - discs[:, 2]).min() > camera.cy_px

@@ -16,6 +16,8 @@ import msgspec
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.camera import Camera
+from chaserdock_models.targets import Box
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.extrapolation import extrapolate
@@ -100,6 +102,7 @@ class FeatureVision(Vision):
         timing, self._errors = scenario.timing, scenario.navigation.errors()
         self._chaser, self._camera = chaser, scenario.camera_model()
         self._tracker = FeatureTracker(self._camera)
+        self._probe = probe_discs(self._camera, scenario.chaser.boxes()[1])
         self._latency_ticks = round(scenario.mapping.latency_s * timing.rate_hz)
         self._odometry: deque[Odometry] = deque(maxlen=REMEMBERED_IMAGES)
         self._maps: deque[LandmarkMap] = deque(maxlen=_MOST_MAPS)
@@ -152,7 +155,7 @@ class FeatureVision(Vision):
         known = None if counting is None else counting.known
         try:
             pixels = decode_image(image)
-            seen = self._tracker.track(pixels, time_s, *pose, known)
+            seen = self._tracker.track(pixels, time_s, *pose, known, self._probe)
         except (BadImage, UnusableImage) as error:
             self.tracks = self._tracks(image, "bad_image", *pose)
             return without_sighting(image, str(error), "bad_image")
@@ -281,6 +284,30 @@ class FeatureVision(Vision):
             described=() if described is None else tuple((described.ids + first).tolist()),
             descriptions=b"" if described is None else described.values.tobytes(),
         )
+
+
+def probe_discs(camera: Camera, probe: Box) -> tuple[tuple[float, float, float], ...]:
+    """Return the discs (x, y, radius), px, that cover a chaser's own probe in its images.
+
+    ``probe``: cuboid along X of CRF.
+    """
+    length_m, *across_m = probe.size_m
+    along = np.arange(0.0, length_m + _DISC_STEP_M, _DISC_STEP_M) - length_m / 2.0
+    places = np.array(probe.position_m) + along[:, None] * np.array([1.0, 0.0, 0.0])
+    at = rotations.rotate_inverse(camera.q_crf_irf_wxyz, places - np.array(camera.position_crf_m))
+    seen = at[at[:, 2] > _NEAREST_M]
+    radii = camera.fx_px * (max(across_m) + _DISC_STEP_M) / seen[:, 2] / np.sqrt(2.0)
+    discs = np.column_stack([camera.project(seen), radii + _DISC_MARGIN_PX])
+    return tuple(
+        (float(x), float(y), float(r)) for x, y, r in discs[np.isfinite(discs).all(axis=1)]
+    )
+
+
+_DISC_STEP_M, _DISC_MARGIN_PX = 0.01, 12.0
+"""Distance of the discs along the probe, m, and what they reach beyond it: half a window of
+tracking."""
+_NEAREST_M = 0.02
+"""Depth beyond which the probe is drawn at all."""
 
 
 def _without_common(covariances_m2: Array) -> Array:

@@ -18,7 +18,7 @@ ENV PYTHONUNBUFFERED=1 HOME=/tmp \
 # What changes rarely comes first. Volumes take over the owner and mode of the folder that they are mounted on.
 RUN useradd --uid 10001 --no-create-home --home-dir /tmp chaserdock \
     && mkdir -p /keys /runs /scenarios \
-    && for name in router world controller standby recorder operator analysis viewer bridge \
+    && for name in router world controller standby mapper recorder operator analysis viewer bridge \
          $(seq -f chaser-%g 0 63); do mkdir /keys/$name; done \
     && chmod -R 1777 /keys
 COPY requirements.txt docker/mujoco-requirements.txt docker/slim.py /opt/chaserdock/

@@ -177,6 +177,21 @@ class StackRest(Struct, frozen=True, kw_only=True):
     since_s: float | None
 
 
+class MappingFigures(Struct, frozen=True, kw_only=True):
+    """What the maps of a target of unknown shape show: status at the end, number of maps, time of
+    the first one, and figures of the last one. None without a map, or without ground truth.
+    """
+
+    status: str
+    maps: int
+    first_map_s: float | None
+    first_rate_error_share: float | None
+    rate_error_share: float | None
+    scale_sigma_share: float | None
+    landmarks: int
+    residual_px: float | None
+
+
 class Latency(Struct, frozen=True, kw_only=True):
     """Wall time from the publication of an image to the actuator command of the same tick."""
 
@@ -263,6 +278,7 @@ class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     cpu_s: dict[str, float] | None = None
     drawn: list[DrawnBody] = []
     stack: StackRest | None = None
+    mapping: MappingFigures | None = None
     plumes: dict[str, PlumeSummary] = {}
 
     @property

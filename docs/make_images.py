@@ -22,8 +22,11 @@ from typing import Any
 import cv2
 import numpy as np
 from chaserdock_agents.chaser.assurance.barriers import Barrier
+from chaserdock_agents.chaser.sighting import decode_image
 from chaserdock_models import rotations
 from chaserdock_models.thruster_bodies import BODIES
+from chaserdock_protocol.messages import PX_STEP, FeatureTracks, Image
+from chaserdock_protocol.recording.log import read_log
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_world.physics.simulation import TARGET, BodyState
 from chaserdock_world.rendering.cameras import Cameras
@@ -31,6 +34,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Polygon
 
 from chaserdock.analysis.flight import RecordedFlight, load_flight
+from chaserdock.analysis.mapping import rate_error
 from chaserdock.analysis.plots import FAINT, GRID, INK, LIMIT, SERIES, colour, styled
 from chaserdock.analysis.pose_errors import pose_error
 from chaserdock.analysis.summary import tracking_errors
@@ -721,6 +725,41 @@ def faults() -> None:
         save(figure, "faults")
 
 
+def unknown() -> None:
+    """Points that a chaser follows in ``unknown-approach``, landmarks and others, and the error of
+    the maps' rate.
+    """
+    f, at_s = flight("unknown-approach"), 100.0
+    image: Image | None = None
+    tracks: FeatureTracks | None = None
+    for record in read_log(logs / "unknown-approach" / "run"):
+        message = record.message
+        if isinstance(message, Image | FeatureTracks) and message.sim_time_ns == round(at_s * 1e9):
+            if message.chaser == 0 and isinstance(message, Image):
+                image = message
+            elif message.chaser == 0:
+                tracks = message
+    assert image is not None
+    assert isinstance(tracks, FeatureTracks)
+    newest = [m for m in f.maps if m.sim_time_ns <= tracks.sim_time_ns][-1]
+    mapped = np.isin(tracks.ids, next(t.ids for t in newest.tracks if t.chaser == 0))
+    px = np.reshape(tracks.places, (-1, 2)) * PX_STEP
+    with styled():
+        figure = Figure(figsize=(8.0, 3.0), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        left.imshow(decode_image(image), cmap="gray", vmin=0, vmax=160)
+        for chosen, text, kind in ((mapped, "landmarks", 0), (~mapped, "others", 1)):
+            left.plot(*px[chosen].T, ".", markersize=2.5, color=colour(kind), label=text)
+        left.set_axis_off()
+        left.legend(loc="lower left", fontsize=7.5)
+        errors = [(m.sim_time_ns / 1e9, rate_error(m, f.motion[TARGET])) for m in f.maps]
+        known = [(t, 100.0 * e) for t, e in errors if e is not None]
+        right.semilogy(*zip(*known, strict=True), "o-", markersize=3, color=colour(0))
+        right.axvline(2.0 * np.pi / 0.0561, color="0.6", linestyle="--", linewidth=0.8)
+        right.set(xlabel="time / s", ylabel="error of the rate / %", xlim=(0, f.flown_s))
+        save(figure, "unknown-target")
+
+
 def steady() -> None:
     """What ``settling_s`` divides."""
     f = flight("four-chaser-docking")
@@ -986,6 +1025,7 @@ PICTURES: dict[str, Callable[[], None]] = {
     "assurance": assurance, "controller": controller, "estimation": estimation,
     "detumble": detumble,
     "docking": docking, "faults": faults, "steady": steady,
+    "unknown-target": unknown,
     "results": results, "reproduction-curves": reproduction, "thrusters": thrusters,
     "targets": targets, "track": tracked, "dataset": dataset, "report": report,
     "campaign": campaign,

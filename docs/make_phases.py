@@ -27,6 +27,7 @@ do not edit. The controller changes phases by this table only.
 MEANING = {
     Phase.ACQUIRE: "waits for the target's pose",
     Phase.SEARCHING: "turns along a search pattern",
+    Phase.SURVEY: "stays in place by its odometry while a target of unknown shape is mapped",
     Phase.HOLD: "keeps its offset from the target",
     Phase.CALIBRATE: (
         "turns about the line of sight, which makes the errors of its camera observable"
@@ -58,7 +59,7 @@ _AT: dict[bool, dict[Phase, tuple[float, float]]] = {
         Phase.ACQUIRE: (0.0, 3.0), Phase.HOLD: (2.2, 3.0), Phase.APPROACH: (4.5, 3.0),
         Phase.DOCKED: (6.5, 3.0), Phase.SEARCHING: (0.0, 1.5), Phase.GOTO: (0.0, 0.5),
         Phase.CALIBRATE: (1.4, 1.2), Phase.INSPECT: (3.3, 1.2), Phase.RETREAT: (4.5, 1.5),
-        Phase.ABORT: (6.3, 1.5),
+        Phase.ABORT: (6.3, 1.5), Phase.SURVEY: (0.0, -0.6),
     },
     True: {
         Phase.ACQUIRE: (0.0, 5.0), Phase.HOLD: (2.2, 5.0), Phase.WAIT: (3.9, 5.0),

@@ -86,8 +86,8 @@ and `msgpack`: [foreign_controller.py](../examples/foreign_controller/foreign_co
   publisher on one key from 0, without gaps. Queries with {", ".join(_WITHOUT_HEAD)} lack these
   fields.
 - Names of processes: `world`, `controller`, `standby` (a second controller), `chaser/0` to
-  `chaser/N-1`, `recorder`, `operator`, `viewer`, `bridge`. A process' branch of keys is its name;
-  both controllers write `controller/…`.
+  `chaser/N-1`, `mapper`, `recorder`, `operator`, `viewer`, `bridge`. A process' branch of keys is
+  its name; both controllers write `controller/…`.
 - A process writes only keys of its own branch. No flight process may read `truth/**` or
   `reference/**`, on which a world without ground truth publishes what it measures of the bodies by
   another system. With a router and keys (`chaserdock keys`, [deployment.md](deployment.md)) both
@@ -128,7 +128,9 @@ controller or standby with all processes, a chaser with the world and the contro
    `Tick`, then, if `images`, an image for every chaser in `chasers`. Messages on different keys may
    come in any order.
 2. A chaser replies to its image with a `Sighting`, also if it detects nothing. With thrusters it
-   replies to its odometry with a `ThrusterReport`.
+   replies to its odometry with a `ThrusterReport`. With `perception.name = "features"` it also
+   replies to its image with `FeatureTracks`, and looks at the image only when the `LandmarkMap` has
+   arrived that counts by then ([unknown-target.md](unknown-target.md#time)).
 3. At each `Tick` a chaser in `chasers` states its lease (`Lease`).
 4. When for each chaser in `chasers` odometry, lease, and the other messages of the tick, have
    arrived, the commanding controller replies with one `WrenchCommand` each, a `TargetEstimate`, and

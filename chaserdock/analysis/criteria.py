@@ -19,6 +19,7 @@ from msgspec import structs
 from chaserdock.criterion import Criterion, criterion
 
 from .flight import LoadHistory, RecordedFlight, SensedDocking
+from .mapping import mapping_criteria
 from .motion import TARGET
 from .rendezvous import rendezvous_criteria
 from .stack import stack_motion
@@ -218,6 +219,7 @@ def reached_time(flight: RecordedFlight, chaser: int) -> float | None:
         return None
     start_s, offset_m = goal
     own, target = flight.motion.pair(chaser)
+    target = flight.estimated_frame(target)
     goal_m = target.position_m + rotations.rotate(target.q_wxyz, np.array(offset_m))
     away = np.linalg.norm(own.position_m - goal_m, axis=1) > success.reached_position_m
     outside = np.flatnonzero(away | (target.time_s < start_s))
@@ -325,7 +327,16 @@ def _flight(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
         yield criterion("keep_distances", "between chasers", nearest, limit_m, "m", side="at least")
 
 
-_PARTS = (_flight, _poses, _captures, _loads, _rest, rendezvous_criteria, _estimates)
+_PARTS = (
+    _flight,
+    _poses,
+    _captures,
+    _loads,
+    _rest,
+    rendezvous_criteria,
+    mapping_criteria,
+    _estimates,
+)
 
 
 def judge(result: dict[str, Any], s: Scenario, skipped: Sequence[str] = ()) -> list[Criterion]:

@@ -7,6 +7,7 @@ import hashlib
 import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import msgspec
@@ -26,6 +27,7 @@ from chaserdock_protocol.messages import (
     DrawnTruth,
     Event,
     Health,
+    LandmarkMap,
     MissionEnd,
     Odometry,
     PassiveSafety,
@@ -55,8 +57,9 @@ from numpy.typing import NDArray
 
 from .actuation import ImpulseTotals, OutputSource, commanded_output, true_output
 from .columns import Columns
+from .mapping import MapFit
 from .mass_properties import values_of
-from .motion import KnownMotion, MotionCollector, Track, motion_columns
+from .motion import TARGET, KnownMotion, MotionCollector, Track, motion_columns
 from .pose_errors import POSE
 
 # Messages whose number or content depends on the wall clock: left out of the digest.
@@ -283,10 +286,10 @@ class RecordedFlight:
     (s), distance (m) and angle (rad) of a chaser's odometry from its reference pose on the
     estimated target. ``estimate_known`` (K,): the target was tracked or predicted. ``relative``: of
     the chasers whose pose the estimator publishes, while the target is known. ``identified``: None
-    without identification. ``end``: None in a log that ends before the mission does. ``begins_s``:
-    time at which a log begins that lacks earlier messages, or None. ``expected_commands``: number
-    of actuator commands that all ticks expected. ``blas``: linear algebra library of each process;
-    empty if an older log does not state it.
+    without identification. ``maps``: of a target of unknown shape. ``end``: None in a log that ends
+    before the mission does. ``begins_s``: time at which a log begins that lacks earlier messages,
+    or None. ``expected_commands``: number of actuator commands that all ticks expected. ``blas``:
+    linear algebra library of each process; empty if an older log does not state it.
     """
 
     scenario: Scenario
@@ -309,6 +312,7 @@ class RecordedFlight:
     innovations: dict[int, InnovationHistory]
     loads: dict[int, LoadHistory]
     identified: IdentificationHistory | None
+    maps: list[LandmarkMap]
     safety: dict[int, SafetyHistory]
     assurance: dict[int, AssuranceHistory]
     plumes: dict[str, PlumeTotals]
@@ -367,6 +371,22 @@ class RecordedFlight:
         if not self.states_criteria:
             lines.append("holds the flight scenario, without success criteria and ground truth")
         return lines
+
+    @cached_property
+    def map_fit(self) -> MapFit | None:
+        """Frame of the map on the target; None unless the target is mapped and its motion known."""
+        if not self.scenario.maps_target or TARGET not in self.motion:
+            return None
+        late = self.estimate.time_s >= self.scenario.settling_s
+        known = np.flatnonzero(self.estimate_known & late)
+        rows, true = self.motion.at(TARGET, self.estimate.time_s[known])
+        return MapFit.of(self.estimate.rows(known[rows]), true) if len(rows) else None
+
+    def estimated_frame(self, target: Track) -> Track:
+        """Return the motion of the frame in which the flight software estimates the target: that
+        of the map, as fitted to the flight; the target's own where its shape is known.
+        """
+        return target if self.map_fit is None else self.map_fit.frame_of(target)
 
     @property
     def estimate(self) -> Track:
@@ -447,6 +467,7 @@ class _Collector:
     loads: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(7)))
     identified: Columns = field(default_factory=lambda: Columns(21))
     stack: StackEstimate | None = None
+    maps: list[LandmarkMap] = field(default_factory=list)
     safety: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(4)))
     assurance: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(4)))
     hazards: dict[int, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
@@ -502,6 +523,7 @@ class _Collector:
                 | DrawnTruth()
                 | PlumeLoad()
                 | StackEstimate()
+                | LandmarkMap()
             ):
                 self._add_report(message)
 
@@ -556,9 +578,12 @@ class _Collector:
         | Health
         | DrawnTruth
         | PlumeLoad
-        | StackEstimate,
+        | StackEstimate
+        | LandmarkMap,
     ) -> None:
         match message:
+            case LandmarkMap():
+                self.maps.append(message)
             case MissionEnd():
                 self.end = message
             case StackEstimate():
@@ -720,6 +745,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         innovations={i: _innovation_history(c.innovations[i]) for i in sorted(c.innovations)},
         loads={i: _load_history(columns) for i, columns in c.loads.items()},
         identified=_identification_history(c),
+        maps=c.maps,
         plumes=dict(c.plumes),
         safety={i: _safety_history(columns) for i, columns in c.safety.items()},
         assurance={i: _assurance_history(rows, c.hazards[i]) for i, rows in c.assurance.items()},

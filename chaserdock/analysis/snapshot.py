@@ -97,10 +97,10 @@ def annotated_image(
 
 
 def seen_text(sighting: Sighting | None) -> str:
-    """Return how a sighting found the target, by a number of markers or by its shape, or that it
-    did not.
+    """Return how a sighting found the target, by a number of markers or without any, or that it did
+    not.
     """
     count = len(sighting.marker_ids) if sighting else 0
     if count:
         return f"{count} marker{'s' if count > 1 else ''}"
-    return "seen by its shape" if sighting is not None and sighting.solutions else "not seen"
+    return "seen without markers" if sighting is not None and sighting.solutions else "not seen"

@@ -37,6 +37,7 @@ from .flight import (
     SightingUse,
     load_flight,
 )
+from .mapping import mapping_of, mapping_text
 from .motion import TARGET, Track
 from .pose_errors import (
     Verticals,
@@ -125,11 +126,27 @@ def blocks(number: int) -> Iterator[slice]:
     return (slice(k, min(k + _BLOCK, number)) for k in range(0, number, _BLOCK))
 
 
-def tracking_errors(flight: RecordedFlight, chaser: int) -> tuple[Array, Array, Array]:
-    """Return times (K,) s, position errors (K,) m and orientation errors (K,) rad of a chaser
-    relative to its true reference.
+def led_pair(flight: RecordedFlight, chaser: int) -> tuple[Track, Track]:
+    """Return the motions of a chaser and of the frame in which it is led, while it is led relative
+    to the target: not in the survey of an unknown one.
     """
     own, target = flight.motion.pair(chaser)
+    target = flight.estimated_frame(target)
+    if not flight.scenario.maps_target:
+        return own, target
+    history = flight.references.get(chaser)
+    led = np.zeros(len(target.time_s), dtype=np.bool_)
+    for begin_s, phase in () if history is None else history.phases:
+        led[target.time_s >= begin_s] = phase != "survey"
+    rows = np.flatnonzero(led)
+    return own.rows(rows), target.rows(rows)
+
+
+def tracking_errors(flight: RecordedFlight, chaser: int) -> tuple[Array, Array, Array]:
+    """Return times (K,) s, position errors (K,) m and orientation errors (K,) rad of a chaser
+    relative to its true reference, without the survey of an unknown target.
+    """
+    own, target = led_pair(flight, chaser)
     n = len(target.time_s)
     position, angle = np.empty(n), np.empty(n)
     for rows in blocks(n):
@@ -147,7 +164,7 @@ def tracking_components(
 
     Own pose relative to the true reference. The orientation error is a rotation vector.
     """
-    own, target = flight.motion.pair(chaser)
+    own, target = led_pair(flight, chaser)
     rows = slice(0, len(target.time_s), step)
     positions, attitudes = true_reference(flight, chaser, rows, target)
     offset = rotations.rotate_inverse(target.q_wxyz[rows], own.position_m[rows] - positions)
@@ -164,7 +181,7 @@ def known_estimates(flight: RecordedFlight) -> tuple[NDArray[np.intp], Track]:
     if TARGET not in flight.motion:
         return known[:0], e.rows(known[:0])
     rows, target = flight.motion.at(TARGET, e.time_s[known])
-    return known[rows], target
+    return known[rows], flight.estimated_frame(target)
 
 
 def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
@@ -197,7 +214,7 @@ def relative_errors(flight: RecordedFlight, chaser: int) -> dict[str, Array]:
         return {name: np.zeros(0) for name in ("time_s", *_POSE_ERRORS)}
     a, target = flight.motion.at(TARGET, history.time_s)
     both, own = flight.motion.at(f"chaser/{chaser}", target.time_s)
-    a, target = a[both], target.rows(both)
+    a, target = a[both], flight.estimated_frame(target.rows(both))
     errors, up = {name: np.empty(len(a)) for name in _POSE_ERRORS}, verticals_of(flight.scenario)
     for rows in blocks(len(a)):
         i, mine, its = a[rows], own.rows(rows), target.rows(rows)
@@ -378,6 +395,8 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         "digest": flight.digest,
     }
 
+    if (mapping := mapping_of(flight.maps, motion.get(TARGET))) is not None:
+        result["mapping"] = mapping
     if flight.plumes:
         result["plumes"] = {body: asdict(totals) for body, totals in sorted(flight.plumes.items())}
     if (stack := stack_rest(flight)) is not None:
@@ -530,6 +549,8 @@ def text_of(result: dict[str, Any]) -> str:
             f"{math.degrees(estimate['max_orientation_error_rad']):.3f}°; mean NEES "
             f"{estimate['nees_mean']:.2f} of 6"
         )
+    if "mapping" in result:
+        lines.append(mapping_text(result["mapping"]))
     if result["mode"] == "realtime" and result["latency_s"]["p50"] is not None:
         latency = result["latency_s"]
         late = "?" if result["late_commands"] is None else result["late_commands"]

@@ -28,7 +28,7 @@ from .help import HELP_OPTIONS, ProgramHelp, add_command
 from .logs import log, play
 from .operate import command, status, view
 from .options import fail
-from .processes import chaser, controller, gateway, record, ros2, router, world
+from .processes import chaser, controller, gateway, mapper, record, ros2, router, world
 from .renamed import renamed
 from .run import campaign, run
 from .scenario import scenario
@@ -43,7 +43,7 @@ stay. With Python's default, 700, collecting among them takes an eighth of a pro
 
 GROUPS: dict[str, tuple[Callable[..., None], ...]] = {
     "Fly": (demo, run, simulate, campaign, reproduce),
-    "Processes": (world, gateway, chaser, controller, record, play, router, ros2),
+    "Processes": (world, gateway, chaser, controller, mapper, record, play, router, ros2),
     "Operate": (command, status, view),
     "Look at a flight": (judge, report, video, log),
     "Compare": (replay, compare, check),

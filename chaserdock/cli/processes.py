@@ -235,6 +235,26 @@ def controller(
 
 
 @with_link_options()
+def mapper(
+    *,
+    link: LinkOptions,
+    timeout: JoinTimeoutOpt = None,
+    stall_s: StallOpt = DEFAULT_STALL_S,
+    watch_parent: WatchOpt = False,
+) -> None:
+    """Run the mapper: maps a target of unknown shape from the points that all chasers follow."""
+    from chaserdock_protocol.process import ProcessOptions
+
+    options = ProcessOptions(
+        link=link.link("mapper", timeout),
+        patience_s=timeout,
+        stall_s=stall_s,
+        watch_parent=watch_parent,
+    )
+    start_process("mapper", options)
+
+
+@with_link_options()
 def record(
     out: OutOpt = None,
     by_run: Annotated[

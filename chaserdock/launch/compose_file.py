@@ -93,6 +93,12 @@ services:
     command: controller -e tls/router:7447 --lease ${{LEASE_S:-10}}
     volumes:
       - keys-controller:/keys:ro
+
+  # Maps a target of unknown shape, if the scenario has one (perception.name = "features").
+  mapper:
+    <<: *member
+    command: mapper -e tls/router:7447 --lease ${{LEASE_S:-10}}
+    volumes: [keys-mapper:/keys:ro, ./scenarios:/scenarios:ro]
 """
 
 _STANDBY = """

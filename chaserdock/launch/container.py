@@ -19,15 +19,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import psutil
 
 from chaserdock.exit_codes import STOPPED
 
+if TYPE_CHECKING:
+    from chaserdock_protocol.scenario import Scenario
+
 ROUTER_TIMEOUT_S = 60.0
 """Time, s, without a connection to the router after which a process considers the mission over."""
 _NOT_IN_SCENARIO = 10
-"""Exit status of ``--check`` if the scenario does not have this chaser."""
+"""Exit status of ``--check`` if the scenario does not have this process."""
 
 
 def is_linked(port: int) -> bool:
@@ -60,10 +64,14 @@ def with_overrides(arguments: list[str], overrides: str) -> list[str]:
 
 def count_chasers(scenario: str, overrides: str) -> int:
     """Return the number of chasers of a scenario. Raises ScenarioError, ScenarioNotFound."""
+    return len(_loaded(scenario, overrides).chasers)
+
+
+def _loaded(scenario: str, overrides: str) -> Scenario:
     from chaserdock_protocol.scenario import load_scenario
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
-    return len(load_scenario(find_scenario(scenario), tuple(shlex.split(overrides))).chasers)
+    return load_scenario(find_scenario(scenario), tuple(shlex.split(overrides)))
 
 
 def too_many_chasers(scenario: str, overrides: str, services: int) -> str | None:
@@ -139,14 +147,15 @@ def main() -> int:
     arguments, environment = sys.argv[1:], os.environ
     host, _, port = environment.get("ROUTER", "router:7447").rpartition(":")
     scenario, overrides = environment.get("SCENARIO", ""), environment.get("SET", "")
-    if arguments[:1] in (["chaser"], ["judge"]):
+    if arguments[:1] in (["chaser"], ["mapper"], ["judge"]):
         # In a process of its own: loading the scenario would keep tens of megabytes for the whole
         # flight.
         check = subprocess.run(
             [sys.executable, "-m", "chaserdock.launch.container", "--check", *arguments]
         )
         if check.returncode == _NOT_IN_SCENARIO:
-            log(f"chaser/{arguments[1]}: not in {scenario}")
+            name = "/".join(arguments[:2]) if arguments[0] == "chaser" else arguments[0]
+            log(f"{name}: not in {scenario}")
             stopped: list[int] = []
             signal.signal(signal.SIGTERM, lambda number, frame: stopped.append(number))
             wait_for_router_exit(host, int(port), lambda: bool(stopped))
@@ -166,6 +175,8 @@ def _check(arguments: list[str], scenario: str, overrides: str, services: int) -
             return (
                 _NOT_IN_SCENARIO if int(arguments[1]) >= count_chasers(scenario, overrides) else 0
             )
+        if arguments[0] == "mapper":
+            return 0 if _loaded(scenario, overrides).maps_target else _NOT_IN_SCENARIO
         reason = too_many_chasers(scenario, overrides, services)
     except ChaserdockError as error:
         reason = str(error)

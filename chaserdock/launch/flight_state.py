@@ -97,6 +97,7 @@ class FlightState:
             "controller",
             *(["standby"] if self.scenario.controller.standby else []),
             *(f"chaser/{i}" for i in range(len(self.scenario.chasers))),
+            *(["mapper"] if self.scenario.maps_target else []),
             "recorder",
         ]
         return [name for name in names if name not in self.present]

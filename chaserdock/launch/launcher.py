@@ -474,7 +474,7 @@ def start_all(
     overrides: tuple[str, ...],
     network: list[str],
 ) -> None:
-    """Start recorder, world, controller and chasers; their order does not matter."""
+    """Start all processes of a mission; their order does not matter."""
     output = folder / "processes"
     timeout = ["--timeout", str(_START_TIMEOUT_S)]
     sets = [item for override in overrides for item in ("--set", override)]
@@ -487,6 +487,8 @@ def start_all(
         fleet.start("standby", ["controller", "--standby", *network, *timeout], output)
     for i in range(len(scenario.chasers)):
         fleet.start(f"chaser/{i}", ["chaser", str(i), *network, *timeout], output)
+    if scenario.maps_target:
+        fleet.start("mapper", ["mapper", *network, *timeout], output)
     fleet.start("recorder", ["record", "--out", str(folder), *network, *timeout], output)
 
 

@@ -49,6 +49,7 @@ STATUS_TOPICS = (
     topics.TICK,
     topics.REFERENCE,
     topics.TARGET,
+    topics.MAP,
     topics.END,
     topics.PRESENCE,
     topics.EVENT,

@@ -10,6 +10,7 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import (
     Event,
+    LandmarkMap,
     MissionEnd,
     Presence,
     Reference,
@@ -43,6 +44,7 @@ class MissionStatus:
     received_s: list[float] = field(default_factory=list[float])
     phases: dict[int, Reference] = field(default_factory=dict[int, Reference])
     target: TargetEstimate | None = None
+    map: LandmarkMap | None = None
     ended: MissionEnd | None = None
     events: list[Event] = field(default_factory=list[Event])
 
@@ -58,6 +60,8 @@ class MissionStatus:
                 self.phases[message.chaser] = message
             case TargetEstimate():
                 self.target = message
+            case LandmarkMap():
+                self.map = message
             case MissionEnd():
                 self.ended = message
             case Event():
@@ -84,6 +88,7 @@ class MissionStatus:
             "speed": self.speed,
             "ended": self.ended.reason if self.ended else None,
             "target": self.target.status if self.target else None,
+            "map": self.map.status if self.map else None,
             "processes": {
                 name: {
                     "instance": self.presence[name].instance if name in self.presence else None,
@@ -158,6 +163,8 @@ def table_of(status: MissionStatus) -> Table:
     head = f"{tick.sim_time_ns / 1e9:.2f} s, tick {tick.tick}{speed}" if tick else "no tick"
     if status.target is not None:
         head += f"; target: {status.target.status}"
+    if status.map is not None:
+        head += f"; map: {status.map.status}"
     if status.ended is not None:
         head += f"; ended: {status.ended.reason}"
     table = Table(title=head)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from chaserdock_agents.chaser import process as chaser
+from chaserdock_agents.mapper import process as mapper
 from chaserdock_agents.recorder import process as recorder
 from chaserdock_controller import process as controller
 from chaserdock_protocol.process import ProcessOptions
@@ -115,7 +116,9 @@ def _spawn(
     options: ProcessOptions,
     others: Mapping[str, ProcessMain],
 ) -> list[Task]:
-    """Start world, controllers, chasers, recorder, and ``others``, some in place of these."""
+    """Start world, controllers, chasers, mapper, recorder, and ``others``, some in place of
+    these.
+    """
     left = dict(others)
 
     def start(name: str, main: ProcessMain, **changes: object) -> Task:
@@ -126,5 +129,7 @@ def _spawn(
     if scenario.controller.standby:
         tasks.append(start("standby", controller.main, standby=True))
     tasks += [start(f"chaser/{i}", chaser.main, chaser=i) for i in range(len(scenario.chasers))]
+    if scenario.maps_target:
+        tasks.append(start("mapper", mapper.main))
     tasks.append(start("recorder", recorder.main))
     return [*tasks, *(start(name, left[name]) for name in tuple(left))]

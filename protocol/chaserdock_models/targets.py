@@ -223,16 +223,25 @@ _MODELS: dict[str, Callable[[], TargetModel]] = {
 }
 
 
+UNKNOWN_TARGET = "unknown"
+"""Name of a target of which neither shape nor markers are known."""
+_UNKNOWN_SIZE_M = 1.0
+"""Edge that is stated for it; no flight software uses it while the motion has constant rates."""
+
+
 def target_names() -> tuple[str, ...]:
-    """Return the names of the built-in targets."""
+    """Return the names of the built-in targets that have a shape."""
     return tuple(sorted(_MODELS))
 
 
 @lru_cache
 def target_model(name: str) -> TargetModel:
-    """Return the built-in target ``name``. Raises ValueError, listing the known names, for any
-    other.
+    """Return the built-in target ``name``, or the unknown one, which is empty. Raises ValueError,
+    listing the known names, for any other.
     """
+    if name == UNKNOWN_TARGET:
+        a = _UNKNOWN_SIZE_M
+        return TargetModel(name, (), (), DEFAULT_DICTIONARY, (a, a, a), 0.0)
     if name not in _MODELS:
         raise ValueError(f"unknown target {name!r}; known: {', '.join(sorted(_MODELS))}")
     return _MODELS[name]()

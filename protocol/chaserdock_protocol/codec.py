@@ -273,6 +273,6 @@ def without_wall_time(message: Message) -> dict[str, Any]:
         name: value
         for name in message.__struct_fields__
         if not name.startswith("wall_")
-        and name not in ("instance", "controllers", "chaser_instances")
+        and name not in ("instance", "controllers", "chaser_instances", "mapper")
         if (value := getattr(message, name)) or name not in _LATER_FIELDS
     }

@@ -56,6 +56,7 @@ Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
 PhaseName = Literal[
     "acquire",
     "searching",
+    "survey",
     "hold",
     "calibrate",
     "inspect",
@@ -231,8 +232,8 @@ class Tick(Message, frozen=True, kw_only=True):
     ``chasers``: those whose reply the world expects. ``controllers``: connected controllers with
     their instances, in the order of succession. ``since``: by process, the tick since which it
     takes part without a break; a lease that was stated before is void. ``chaser_instances``:
-    instances of ``chasers``, by process. A process that is listed with another instance was lost
-    and replaced; it ends.
+    instances of ``chasers``, by process. ``mapper``: instance of a connected mapper. A process that
+    is listed with another instance was lost and replaced; it ends.
     """
 
     revision: Count = 0
@@ -241,6 +242,7 @@ class Tick(Message, frozen=True, kw_only=True):
     controllers: Names = msgspec.field(default_factory=dict)
     since: Counts = msgspec.field(default_factory=dict)
     chaser_instances: Names = msgspec.field(default_factory=dict)
+    mapper: Text = ""
 
 
 class MissionEnd(Message, frozen=True, kw_only=True):
@@ -448,6 +450,101 @@ class Sighting(Message, frozen=True, kw_only=True):
     geometry: GeometryMeasurement | None = None
     acquiring: bool = False
     wall_estimate_s: float = 0.0
+
+
+PX_STEP, AGE_STEP_S = 1.0 / 64.0, 0.2
+"""Units of ``FeatureTracks``: a tenth of the noise of a point, px; the interval of images, s."""
+DESCRIPTION_BYTES = 128
+"""Size of the description of a point in ``FeatureTracks``."""
+MAX_TRACKS = 1000
+"""Most points of an image, and most landmarks of a map."""
+TrackIds = Annotated[tuple[Count, ...], Meta(max_length=MAX_TRACKS)]
+
+
+class FeatureTracks(Message, frozen=True, kw_only=True):
+    """Points of the target that a chaser follows in one image, without knowledge of its shape.
+
+    ``position_m``, ``q_wxyz``: optical centre and attitude (IRF to WRF) of the camera by odometry
+    and calibration. Of n points: ``ids``, ascending and never reused in a mission; ``places``, u
+    and v of each, ideal pixels in steps of 1/64 px; ``ages``, for how long each was followed, in
+    steps of 0.2 s. ``described`` (k,): ids of points with a description, in ``descriptions``, 128
+    bytes each; empty in most images. ``status``: of the image, as in ``Sighting``.
+    """
+
+    chaser: ChaserId
+    status: Literal["seen", "nothing", "bad_image"]
+    position_m: Vector3
+    q_wxyz: Quaternion
+    ids: TrackIds = ()
+    places: Annotated[
+        tuple[Annotated[int, Meta(ge=-(2**20), le=2**20)], ...], Meta(max_length=2 * MAX_TRACKS)
+    ] = ()
+    ages: TrackIds = ()
+    described: TrackIds = ()
+    descriptions: Annotated[bytes, Meta(max_length=DESCRIPTION_BYTES * MAX_TRACKS)] = b""
+
+
+MapStatus = Literal[
+    "gathering",
+    "no texture",
+    "does not turn",
+    "ambiguous",
+    "inconsistent",
+    "scale unknown",
+    "mapped",
+]
+"""Why there is no map yet, or how good it is.
+
+``gathering``: views span too short a time. ``no texture``: too few points. ``does not turn``:
+points do not move. ``ambiguous``: two motions explain the images alike. ``inconsistent``: none
+does, or updates disagree. ``scale unknown``: one camera, or all on one line, tell no distances: no
+approach. ``mapped``.
+"""
+
+
+class MappedMotion(Struct, frozen=True, kw_only=True):
+    """Motion of a mapped target at the time of its message, at constant rates.
+
+    Frames and ``covariance`` as in ``TargetEstimate``. TRF: axes and origin are those of the map.
+    """
+
+    position_m: Vector3
+    velocity_m_s: Vector3
+    q_wxyz: Quaternion
+    omega_rad_s: Vector3
+    covariance: Square12
+
+
+class KnownTracks(Struct, frozen=True, kw_only=True):
+    """Points of chaser ``chaser`` that are landmarks of a map: their ``ids`` (n,), ascending, and
+    the numbers of their ``landmarks`` (n,).
+    """
+
+    chaser: ChaserId
+    ids: Annotated[tuple[Count, ...], Meta(max_length=10 * MAX_TRACKS)]
+    landmarks: Annotated[tuple[Count, ...], Meta(max_length=10 * MAX_TRACKS)]
+
+
+class LandmarkMap(Message, frozen=True, kw_only=True):
+    """Map of a target of unknown shape from all images up to ``tick``. It counts from
+    ``mapping.latency_s`` later on; the next one is from images up to ``next_tick`` at the earliest.
+
+    ``instance``: of the mapper's process. Without a map (see ``status``) there are neither
+    ``motion`` nor landmarks. ``landmarks_m``: 3 numbers a landmark, TRF; ``moments_m2``: 6 numbers
+    of its covariance (xx, yy, zz, xy, xz, yz). ``scale_share``: standard deviation of all
+    distances, as a share; 1 without a map. ``residual_px``: median of the points'.
+    """
+
+    status: MapStatus
+    next_tick: Count
+    instance: Text = ""
+    motion: MappedMotion | None = None
+    landmarks_m: Annotated[tuple[float, ...], Meta(max_length=3 * MAX_TRACKS)] = ()
+    moments_m2: Annotated[tuple[float, ...], Meta(max_length=6 * MAX_TRACKS)] = ()
+    tracks: Annotated[tuple[KnownTracks, ...], Meta(max_length=256)] = ()
+    scale_share: float = 1.0
+    residual_px: float = 0.0
+    merges: Count = 0
 
 
 class Innovation(Struct, frozen=True, kw_only=True):
@@ -918,6 +1015,8 @@ VERSION: dict[type[Struct], int] = {
     PlumeLoad: 1,
     DrawnTruth: 1,
     Sighting: 2,
+    FeatureTracks: 1,
+    LandmarkMap: 1,
     TargetEstimate: 1,
     StackEstimate: 1,
     Reference: 1,

@@ -17,13 +17,21 @@ from msgspec import Struct
 from . import messages as m
 
 Role = Literal[
-    "world", "chaser", "controller", "recorder", "operator", "analysis", "viewer", "bridge"
+    "world",
+    "chaser",
+    "controller",
+    "mapper",
+    "recorder",
+    "operator",
+    "analysis",
+    "viewer",
+    "bridge",
 ]
 Qos = Literal["bulk", "state", "command", "event"]
 
 CONTROLLERS = ("controller", "standby")
 """Processes of the role ``controller``, in the order of succession."""
-FLYING: frozenset[Role] = frozenset({"chaser", "controller"})
+FLYING: frozenset[Role] = frozenset({"chaser", "controller", "mapper"})
 _EVERYONE: frozenset[Role] = frozenset(get_args(Role))
 _OBSERVERS: frozenset[Role] = frozenset({"recorder", "operator", "analysis", "viewer", "bridge"})
 _TRUTH_READERS: frozenset[Role] = frozenset({"recorder", "analysis", "viewer"})
@@ -68,8 +76,8 @@ def _topic(key, kind, writer, readers, rate, qos) -> Topic:
     return Topic(key, kind, writer, frozenset(readers) | _OBSERVERS, rate, qos)
 
 
-TICK = _topic("world/tick", m.Tick, "world", {"chaser", "controller"}, "tick", "state")
-END = _topic("world/end", m.MissionEnd, "world", {"chaser", "controller"}, "event", "event")
+TICK = _topic("world/tick", m.Tick, "world", FLYING, "tick", "state")
+END = _topic("world/end", m.MissionEnd, "world", FLYING, "event", "event")
 IMAGE = _topic("world/chaser/{chaser}/image", m.Image, "world", {"chaser"}, "image", "bulk")
 ODOMETRY = _topic(
     "world/chaser/{chaser}/odometry", m.Odometry, "world", {"chaser", "controller"}, "tick", "state"
@@ -95,6 +103,10 @@ TRUTH_DRAWN = Topic("truth/drawn", m.DrawnTruth, "world", _TRUTH_READERS, "event
 SIGHTING = _topic(
     "chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "image", "state"
 )
+FEATURES = _topic(
+    "chaser/{chaser}/features", m.FeatureTracks, "chaser", {"mapper"}, "image", "state"
+)
+MAP = _topic("mapper/map", m.LandmarkMap, "mapper", {"chaser"}, "event", "state")
 ACTUATORS = _topic(
     "chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command"
 )
@@ -150,6 +162,8 @@ TOPICS: tuple[Topic, ...] = (
     TRUTH_DRAWN,
     BODY_REFERENCE,
     SIGHTING,
+    FEATURES,
+    MAP,
     ACTUATORS,
     ASSURANCE,
     THRUSTERS,
@@ -230,7 +244,7 @@ def is_process_name(name: str) -> bool:
     head, slash, number = name.partition("/")
     if head == "chaser":
         return slash == "/" and _is_number(number)
-    members = {"world", *CONTROLLERS, "recorder", "operator", "viewer", "bridge"}
+    members = {"world", *CONTROLLERS, "mapper", "recorder", "operator", "viewer", "bridge"}
     return slash == "" and head in members | _NON_MEMBERS
 
 

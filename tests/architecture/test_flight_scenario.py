@@ -179,7 +179,8 @@ def test_flight_scenario_keeps_its_values_and_types(name: str) -> None:
     assert type(flight.target) is FlightScenario.model_fields["target"].annotation
     assert type(flight.camera) is FlightScenario.model_fields["camera"].annotation
     assert flight.camera_model() == full.camera_model()
-    assert flight.target_model() == full.target_model()
+    if not full.maps_target:
+        assert flight.target_model() == full.target_model()
     assert (flight.timing, flight.chaser, flight.docking) == (
         full.timing,
         full.chaser,
@@ -190,6 +191,56 @@ def test_flight_scenario_keeps_its_values_and_types(name: str) -> None:
         == flight
         == flight_scenario(flight)
     )
+
+
+def test_flight_software_that_maps_its_target_knows_nothing_of_it() -> None:
+    full = load_scenario(shipped_scenario("unknown-inspection"))
+    flight = flight_scenario(full)
+    model = flight.target_model()
+    assert full.target_model().boxes
+    assert (model.boxes, model.markers, model.satellite) == ((), (), "")
+    assert flight.target.known_mesh() is flight.target.nominal_mesh() is flight.target.geometry
+    text = flight_scenario_json(full)
+    assert full.target.model not in text
+    # Another satellite, or a mass, changes nothing of what flight software gets.
+    changes = {"target": {"model": "cubesat_12u", "mass_kg": 7.0, "centre_of_mass_m": [0.1, 0, 0]}}
+    values = {"perception": {"name": "features"}}
+    other = scenario(CHASER, **values, **changes)
+    assert flight_scenario_json(other) == flight_scenario_json(
+        scenario(CHASER, **values, target={"model": "geo_servicer"})
+    )
+
+
+def test_flight_software_that_maps_its_target_refuses_to_know_it() -> None:
+    values = json.loads(
+        flight_scenario_json(scenario(CHASER, target={"model": "geo_servicer"}, **_BY_SHAPE))
+    )
+    assert values["target"]["model"] == "geo_servicer"
+    values["perception"]["name"] = "features"
+    with pytest.raises(ScenarioError, match="may know nothing of it"):
+        flight_scenario_from_json(json.dumps(values), "test")
+    values["target"] = {"motion": "constant_rates", "model": "unknown"}
+    assert flight_scenario_from_json(json.dumps(values), "test").maps_target
+
+
+_BY_SHAPE = {"perception": {"name": "model"}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"target": {"motion": "torque_free"}}, "maps constant rates only"),
+        ({"limits": {"min_distance_shape_m": 0.1}}, "the shape of the target is unknown"),
+        ({"target": {"model": "unknown"}}, "the world needs a shape"),
+        ({"docking": {"kind": "capture"}}, "docking"),
+        ({"mapping": {"latency_s": 0.4}, "time": {"rate_hz": 2, "image_hz": 2}}, "interval of"),
+    ],
+)
+def test_missions_that_need_a_known_shape_are_refused(
+    changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        scenario(CHASER, perception={"name": "features"}, **changes)
 
 
 def test_flight_software_refuses_a_full_scenario() -> None:

@@ -127,7 +127,7 @@ def test_generated_file_has_the_services_and_volumes_of_the_mission(
     chasers: int, more: bool
 ) -> None:
     project = YAML(typ="safe").load(compose_file(chasers, standby=more, view=more))
-    members = {"router", "world", "controller", "recorder", "mission", "operator"}
+    members = {"router", "world", "controller", "mapper", "recorder", "mission", "operator"}
     members |= {"standby", "viewer"} if more else set()
     assert set(project["services"]) == members | {f"chaser-{i}" for i in range(chasers)}
     mounted = {

@@ -55,7 +55,9 @@ def flight(s: Scenario, chaser_m: np.ndarray, target_q: np.ndarray) -> Any:
         "target": track(time_s, q_wxyz=target_q),
         "chaser/0": track(time_s, position_m=chaser_m),
     }
-    return SimpleNamespace(scenario=s, motion=true_motion(tracks))
+    return SimpleNamespace(
+        scenario=s, motion=true_motion(tracks), estimated_frame=lambda target: target
+    )
 
 
 def test_goal_counts_as_reached_from_when_the_chaser_stays() -> None:

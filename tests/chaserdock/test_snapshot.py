@@ -27,7 +27,7 @@ POSE = PoseSolution(
         ((), (), "not seen"),
         ((4,), (POSE,), "1 marker"),
         ((4, 5), (), "2 markers"),
-        ((), (POSE,), "seen by its shape"),
+        ((), (POSE,), "seen without markers"),
     ],
 )
 def test_text_states_by_what_the_target_was_found(

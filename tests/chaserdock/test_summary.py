@@ -35,6 +35,7 @@ GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
 RUN_ONLY = {"peak_memory_bytes", "cpu_s", "run_failure"}
 DETUMBLING_ONLY = {"stack"}
 PLUMES_ONLY = {"plumes"}
+MAPS_ONLY = {"mapping"}
 IN_SOME_FLIGHTS = {
     "capture",
     "passive_safety",
@@ -54,7 +55,7 @@ def documented() -> set[str]:
 
 def test_typed_summary_has_the_produced_fields() -> None:
     produced: dict[str, Any] = summarize(GOLDEN)
-    assert set(produced) | RUN_ONLY | DETUMBLING_ONLY | PLUMES_ONLY == set(
+    assert set(produced) | RUN_ONLY | DETUMBLING_ONLY | PLUMES_ONLY | MAPS_ONLY == set(
         Summary.__struct_fields__
     )
     assert Summary.from_dict(produced).digest == produced["digest"]
@@ -65,7 +66,7 @@ def test_documented_fields_equal_the_produced_fields() -> None:
     names = {name.removeprefix("chasers.<id>.").partition(".")[0] for name in documented()}
     chaser = next(iter(produced["chasers"].values()))
     expected = (set(produced) - {"chasers"}) | set(chaser) | IN_SOME_FLIGHTS
-    expected |= RUN_ONLY | DETUMBLING_ONLY | PLUMES_ONLY
+    expected |= RUN_ONLY | DETUMBLING_ONLY | PLUMES_ONLY | MAPS_ONLY
     assert names == expected
 
 

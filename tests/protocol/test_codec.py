@@ -64,6 +64,8 @@ def test_there_is_a_sample_of_every_message() -> None:
         m.GeometryEstimate,
         m.GeometryMeasurement,
         m.Innovation,
+        m.KnownTracks,
+        m.MappedMotion,
         m.MassEstimate,
         m.PoseSolution,
         m.ProbeTouch,
@@ -201,7 +203,7 @@ def test_every_quaternion_must_be_of_unit_length() -> None:
                 assert rejection(type(sample), repacked(values)).reason == "not_unit_quaternion"
             owner["q_wxyz"] = [0.5, 0.5, 0.5, 0.5 + 1e-8]  # rounding passes
             codec.decode(type(sample), repacked(values))
-    assert seen == 7
+    assert seen == 8
 
 
 @pytest.mark.parametrize(
@@ -227,6 +229,18 @@ def test_every_quaternion_must_be_of_unit_length() -> None:
         (m.TargetEstimate, "status", "fine"),
         (m.Sighting, "solutions", [as_lists(SOLUTION)] * 5),
         (m.Sighting, "solutions", [as_lists(SOLUTION) | {"covariance": [1.0] * 35}]),
+        (m.FeatureTracks, "ids", [-1]),
+        (m.FeatureTracks, "ids", list(range(1001))),
+        (m.FeatureTracks, "places", [0.5, 1.0]),
+        (m.FeatureTracks, "places", [2**20 + 1, 0]),
+        (m.FeatureTracks, "ages", [-1]),
+        (m.FeatureTracks, "descriptions", bytes(128 * 1000 + 1)),
+        (m.FeatureTracks, "status", "fine"),
+        (m.LandmarkMap, "status", "fine"),
+        (m.LandmarkMap, "landmarks_m", [0.0] * 3001),
+        (m.LandmarkMap, "moments_m2", [0.0] * 6001),
+        (m.LandmarkMap, "next_tick", -1),
+        (m.LandmarkMap, "tracks", [{"chaser": 1, "ids": [0], "landmarks": [-1]}]),
         (m.Image, "encoding", "png"),
         (m.Image, "width_px", 0),
         (m.Image, "height_px", 8193),

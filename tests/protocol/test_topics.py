@@ -145,7 +145,7 @@ def test_flight_roles_may_not_read_the_truth() -> None:
     assert not any(
         t.kind in (m.BodyTruth, m.WorldTruth, m.DrawnTruth) for t in TOPICS if t not in truths
     )
-    assert {"chaser", "controller"} == FLYING
+    assert {"chaser", "controller", "mapper"} == FLYING
 
 
 def test_everyone_writes_on_their_own_branch_only() -> None:

@@ -6,7 +6,8 @@ It has no access to ground truth.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Iterator
 
 import msgspec
 import numpy as np
@@ -18,6 +19,7 @@ from chaserdock_protocol.messages import (
     ActuatorCommand,
     DockingStatus,
     Image,
+    LandmarkMap,
     Message,
     Odometry,
     Plan,
@@ -36,10 +38,10 @@ from .command_gate import CommandGate, passed_on
 from .fallback_control import FallbackControl
 from .inbox import ChaserInbox
 from .outbox import ChaserOutputs, Outbox
-from .perception import make_perception
 from .thrusters.controller import ThrusterController
 from .thrusters.failure_reports import FailureReports
-from .vision import Vision
+from .vision import REMEMBERED_IMAGES, Vision
+from .visions import make_vision
 
 
 class ChaserCore:
@@ -64,7 +66,8 @@ class ChaserCore:
         self.realtime, self.instance = realtime, instance
         self.outbox, self._seen = Outbox(number), Outbox(number)
         self.inbox = ChaserInbox()
-        self.vision = vision or Vision(make_perception(scenario))
+        self.vision = vision or make_vision(scenario, number)
+        self._images: deque[Image] = deque(maxlen=REMEMBERED_IMAGES)
         self._perception_watch = FailureWatch(scenario.perception.name)
         self.gate = CommandGate(scenario, number, realtime, self.outbox)
         self.fallback = FallbackControl(scenario, number, self.outbox)
@@ -87,6 +90,7 @@ class ChaserCore:
             case Tick():
                 self._begin_tick(message)
             case Odometry():
+                self.vision.take(message)
                 if self._is_new(inbox.add_odometry(message, received.arrived_s)):
                     self._continue_tick(message)
             case DockingStatus():
@@ -94,7 +98,9 @@ class ChaserCore:
                     self._observe_thrusters()
                     self._execute_waiting()
             case Image():
-                return self.look(message)
+                self.add_image(message)
+            case LandmarkMap():
+                self.vision.take(message)
             case Plan():
                 self._is_new(self.fallback.add_plan(message))
             case TargetEstimate():
@@ -103,7 +109,28 @@ class ChaserCore:
                 self._take_command(message, inbox.time_ns(now_s if self.realtime else None))
             case LostMessage():
                 self._replace_lost(received.topic, message)
-        return self.outbox.take()
+        return self._with_due_images(self.outbox.take())
+
+    def _with_due_images(self, outputs: ChaserOutputs) -> ChaserOutputs:
+        """Look at the images that are due; in real time the process does, in the background."""
+        for image in () if self.realtime else self.due_images():
+            outputs.follow(self.look(image))
+        return outputs
+
+    def add_image(self, image: Image) -> None:
+        """Take an image, to be looked at once it is due; in real time it replaces one that waits
+        still.
+        """
+        if self.realtime:
+            self._images.clear()
+        self._images.append(image)
+
+    def due_images(self) -> Iterator[Image]:
+        """Yield the images for which all has arrived that is needed to look at them."""
+        while self._images:
+            if self.vision.missing(self._images[0], self.inbox.tick, self.realtime):
+                return
+            yield self._images.popleft()
 
     def missing_keys(self) -> tuple[str, ...]:
         """Return the keys of the messages that this chaser needs to reply to the open tick, or to
@@ -117,6 +144,10 @@ class ChaserCore:
             latest[topics.DOCKING] = self.inbox.docking
         missing = [topic for topic, last in latest.items() if last is None or last.tick < tick.tick]
         if tick.images and not self.vision.has_processed(tick.tick):
+            waiting = self._images[0] if self._images else None
+            needed = waiting and self.vision.missing(waiting, tick, self.realtime)
+            if needed is topics.MAP:
+                return (topics.MAP.key_of(),)
             missing.append(topics.IMAGE)
         return tuple(topic.key_of(self.number) for topic in missing or [topics.WRENCH])
 
@@ -161,9 +192,11 @@ class ChaserCore:
                 rejected_ids=(),
                 detail="image lost",
             )
-            self.outbox.publish(topics.SIGHTING, no_image)
+            self.vision.without_image(no_image)
+            self._publish_sighting(self.outbox, no_image)
         elif topic is topics.ODOMETRY and inbox.odometry is not None:
             if self._is_new(inbox.extrapolate_odometry(lost)):
+                self.vision.take(inbox.odometry)
                 self._continue_tick(inbox.odometry)
         elif topic is topics.DOCKING and inbox.assume_docking(lost, self.number):
             self._observe_thrusters()
@@ -185,8 +218,13 @@ class ChaserCore:
         if sighting.status == "bad_image" and (before is None or before.status != "bad_image"):
             self._seen.warn("bad image", sighting.detail, image.tick, image.sim_time_ns)
         self._watch_perception("perception failed", self.vision.failure, image)
-        self._seen.publish(topics.SIGHTING, sighting)
+        self._publish_sighting(self._seen, sighting)
         return self._seen.take()
+
+    def _publish_sighting(self, outbox: Outbox, sighting: Sighting) -> None:
+        if self.vision.tracks is not None:
+            outbox.publish(topics.FEATURES, self.vision.tracks)
+        outbox.publish(topics.SIGHTING, sighting)
 
     def note_duration(self, image: Image, took_s: float) -> ChaserOutputs:
         """Return what to publish of the time that an image took, in real time: a warning if no

@@ -30,6 +30,12 @@ class ChaserOutputs:
         """Return whether anything follows."""
         return bool(self.messages or self.stale or self.rejected)
 
+    def follow(self, later: ChaserOutputs) -> None:
+        """Append what follows from another message."""
+        self.messages += later.messages
+        self.stale |= later.stale
+        self.rejected = self.rejected or later.rejected
+
 
 class Outbox:
     """Collects the outputs of chaser ``chaser`` from the parts of its core."""

@@ -84,6 +84,9 @@ class ChaserProcess:
             node.advertise(topics.THRUSTERS, i)
         if core.assurance is not None:
             node.advertise(topics.ASSURANCE, i)
+        if core.scenario.maps_target:
+            node.advertise(topics.FEATURES, i)
+            node.subscribe(topics.MAP)
         node.subscribe(topics.IMAGE, i, latest=latest)
         node.subscribe(topics.ODOMETRY, i, latest=latest)
         for topic in (topics.DOCKING, topics.PLAN, topics.WRENCH):
@@ -114,10 +117,17 @@ class ChaserProcess:
                 self.look_at(image)
             case _:
                 self._step(received)
+                self._look_at_due()
 
     def look_at(self, image: Image) -> None:
-        """Have an image looked at in the background, in real time."""
-        self._put_image(image)
+        """Have an image looked at in the background, in real time, once it is due."""
+        self.core.add_image(image)
+        self._look_at_due()
+
+    def _look_at_due(self) -> None:
+        if self.core.realtime:
+            for image in self.core.due_images():
+                self._put_image(image)
 
     def warn(self, what: str, detail: str) -> None:
         """Publish a warning of what is attached to the process."""

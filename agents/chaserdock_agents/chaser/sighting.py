@@ -6,7 +6,7 @@ A pure function of image, prediction and parameters.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -111,15 +111,17 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
         sighting = _measure(perception, pixels, image.ranging, predicted, header)
         codec.decode(Sighting, codec.encode(sighting))  # raises what a reader would refuse
     except (BadImage, UnusableImage) as error:
-        return Sighting(**header, status="bad_image", **_EMPTY, detail=str(error)[:LONGEST_TEXT])
+        return without_sighting(image, str(error), "bad_image")
     except Exception as error:  # an installed perception may raise or return anything
         raise PerceptionFailed(text_of(error)) from error
     return sighting
 
 
-def without_sighting(image: Image, reason: str) -> Sighting:
-    """Return the sighting of an image in which perception failed."""
-    return Sighting(**_header(image), status="nothing", **_EMPTY, detail=reason)
+def without_sighting(
+    image: Image, reason: str, status: Literal["nothing", "bad_image"] = "nothing"
+) -> Sighting:
+    """Return the sighting of an image that shows no pose, and why."""
+    return Sighting(**_header(image), status=status, **_EMPTY, detail=reason[:LONGEST_TEXT])
 
 
 _EMPTY: dict[str, Any] = {"solutions": (), "marker_ids": (), "corners_px": (), "rejected_ids": ()}
@@ -140,7 +142,7 @@ def _measure(
     seen = perception.estimate(pixels, predicted)
     if not hasattr(seen, "solutions"):
         raise TypeError(f"estimate() returned {type(seen).__name__}, not a PerceptionResult")
-    solutions, detail = tuple(_solution(pose) for pose in seen.solutions), ""
+    solutions, detail = tuple(pose_solution(pose) for pose in seen.solutions), ""
     rejected = tuple(int(i) for i in seen.rejected_ids)
     if ranging is not None and isinstance(perception, FarPerception):
         try:
@@ -181,7 +183,8 @@ def _variance(pose: PoseSolution) -> float:
     return pose.covariance[0] + pose.covariance[7] + pose.covariance[14]
 
 
-def _solution(pose: TargetPose) -> PoseSolution:
+def pose_solution(pose: TargetPose) -> PoseSolution:
+    """Convert a pose of the target to its part of a message."""
     return PoseSolution(
         position_m=vector(pose.position_irf_m),
         q_wxyz=vector(pose.q_irf_trf_wxyz),
@@ -200,7 +203,7 @@ def _by_bearing(
     target = RangedTarget(
         measured.range_m, measured.range_sigma_m, np.array(measured.q_wxyz), covariance
     )
-    return _solution(finder.find(pixels, target, None if predicted is None else predicted[0]))
+    return pose_solution(finder.find(pixels, target, None if predicted is None else predicted[0]))
 
 
 def geometry_message(found: GeometryInformation) -> GeometryMeasurement:

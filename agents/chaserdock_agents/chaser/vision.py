@@ -8,11 +8,16 @@ from collections import deque
 
 from chaserdock_protocol.messages import (
     ExpectedPose,
+    FeatureTracks,
     GeometryEstimate,
     Image,
+    LandmarkMap,
+    Odometry,
     Sighting,
+    Tick,
     WrenchCommand,
 )
+from chaserdock_protocol.topics import Topic
 
 from .perception import PerceptionMethod
 from .sighting import (
@@ -37,12 +42,14 @@ class Vision:
     a geometry that came during an image was refused after it. ``look`` may run in a thread beside
     the other methods.
     ``perception``: None for a chaser that gets no images, as in studies with drawn sightings.
+    ``tracks``: points in the last image, of a perception that does not know the target's shape.
     """
 
     def __init__(self, perception: PerceptionMethod | None) -> None:
         self.perception = perception
         self.sighting: Sighting | None = None
         self.failure = self.refused = ""
+        self.tracks: FeatureTracks | None = None
         self._looking = threading.Lock()
         self._geometry: GeometryEstimate | None = None
         self._expected: ExpectedPose | None = None
@@ -71,6 +78,21 @@ class Vision:
             self.failure = str(error)
             self.sighting = without_sighting(image, self.failure)
         return self.sighting
+
+    def take(self, message: Odometry | LandmarkMap) -> None:
+        """Take the chaser's own state, or what is known of the target."""
+
+    def missing(self, image: Image, tick: Tick | None, realtime: bool) -> Topic | None:
+        """Return the topic of a message without which an image cannot be looked at yet, or None.
+
+        ``tick``: the newest one.
+        """
+        return None
+
+    def without_image(self, missed: Sighting) -> None:
+        """Note that an image will not come; ``missed``: what is published in place of a
+        sighting.
+        """
 
     def has_processed(self, tick: int) -> bool:
         """Return whether an image of a tick was processed."""

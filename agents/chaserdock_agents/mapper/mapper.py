@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
+from chaserdock_protocol.messages import MapStatus
 from numpy.typing import NDArray
 
 from .adjustment import (
@@ -37,23 +37,7 @@ from .types import (
     Observations,
 )
 
-Status = Literal[
-    "gathering",
-    "no texture",
-    "does not turn",
-    "ambiguous",
-    "inconsistent",
-    "scale unknown",
-    "mapped",
-]
-"""Why there is no map yet, or how good it is.
-
-``gathering``: views span too short a time. ``no texture``: too few points. ``does not turn``:
-points do not move. ``ambiguous``: two motions explain the images alike. ``inconsistent``: none
-does, or updates disagree. ``scale unknown``: one camera, or all on one line, tell no distances: no
-approach. ``mapped``.
-"""
-MAP_STATUS: tuple[Status, ...] = ("scale unknown", "mapped")
+MAP_STATUS: tuple[MapStatus, ...] = ("scale unknown", "mapped")
 
 
 @dataclass(frozen=True)
@@ -118,7 +102,7 @@ class TargetMap:
     """
 
     time_s: float
-    status: Status
+    status: MapStatus
     motion: ConstantRates | None = None
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     cameras: Array = field(default_factory=lambda: np.zeros((0, CAMERA)))
@@ -159,17 +143,27 @@ class Mapper:
         """The motion as last estimated, None before a map."""
         return None if self._last is None else self._last.estimate.motion
 
+    def known_tracks(self, chaser: int) -> tuple[IntArray, IntArray]:
+        """Return the ids (n,), ascending, of a chaser's tracks that are landmarks, and the rows
+        (n,) of these in the last map.
+        """
+        views = self._views[chaser]
+        if self._last is None or not views:
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        ids = np.unique(np.concatenate([v.ids for v in views]))
+        roots = self.merges.roots(_keys(chaser, ids))
+        at = np.minimum(np.searchsorted(self._keys, roots), len(self._keys) - 1)
+        mapped = self._keys[at] == roots
+        return ids[mapped], at[mapped]
+
     def known_points(self, chaser: int) -> tuple[IntArray, Array]:
         """Return the ids (n,), ascending, of a chaser's tracks that are landmarks, and where these
         are, (n, 3), TRF.
         """
+        ids, rows = self.known_tracks(chaser)
         if self._last is None:
-            return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        ids = np.unique(np.concatenate([v.ids for v in self._views[chaser]]))
-        roots = self.merges.roots(_keys(chaser, ids))
-        at = np.minimum(np.searchsorted(self._keys, roots), len(self._keys) - 1)
-        mapped = self._keys[at] == roots
-        return ids[mapped], self._last.estimate.landmarks_m[at[mapped]]
+            return ids, np.zeros((0, 3))
+        return ids, self._last.estimate.landmarks_m[rows]
 
     def add(self, tracks: ImageTracks) -> None:
         """Take the points of one image; images of a chaser come in the order of time."""
@@ -331,7 +325,7 @@ class Mapper:
         line = found.centre_m - away[0] if away else found.centre_m
         range_m = float(np.linalg.norm(line))
         scale = float(np.sqrt(line @ found.centre_covariance_m2 @ line)) / range_m**2
-        status: Status = "mapped" if scale < self.tuning.scale_share else "scale unknown"
+        status: MapStatus = "mapped" if scale < self.tuning.scale_share else "scale unknown"
         return TargetMap(
             time_s, status, estimate.motion, found.covariance[:9, :9], estimate.cameras, keys,
             estimate.landmarks_m, found.landmark_covariances_m2, scale,

@@ -122,7 +122,9 @@ class ViewerLayer:
     def _write_static(self, time_ns: int) -> None:
         """Write the static content: camera frames and the shapes of the bodies."""
         stamp = _time(time_ns)
-        shapes = [("target", self._scenario.target_model().size_m, _TARGET_COLOUR)]
+        boxes = self._scenario.target_model().boxes  # none of an unknown target
+        size_m = self._scenario.target_model().size_m
+        shapes = [("target", size_m, _TARGET_COLOUR)] if boxes else []
         for i in range(len(self._scenario.chasers)):
             self._put(
                 "tf",
@@ -150,9 +152,7 @@ class ViewerLayer:
             else _outline([Box(body.size_m)])
         )
         mesh = self._scenario.target.nominal_mesh(_SPACING_M)
-        target = (
-            _outline(self._scenario.target_model().boxes) if mesh is None else _mesh_points(mesh)
-        )
+        target = _outline(boxes) if mesh is None else _mesh_points(mesh)
         self._put("target/points", _cloud(stamp, "target", target), time_ns)
         for i in range(len(self._scenario.chasers)):
             self._put(f"chaser/{i}/points", _cloud(stamp, f"chaser/{i}", chaser), time_ns)
@@ -201,7 +201,7 @@ class ViewerLayer:
 
 def _outline(boxes: Iterable[Box]) -> Array:
     """Return points (N, 3) on the edges of boxes, in the axes of their body."""
-    points = []
+    points = [np.zeros((0, 3))]
     for box in boxes:
         corners = cuboid_corners(box.size_m)
         pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]

@@ -125,8 +125,8 @@ class ChaserMachine:
     ``seen``, its state at its port; ``relative``, its state relative to the target where passive
     safety is enforced. ``failure``: why no plan of it can be flown. ``interrupted``: it resumes its
     approach when the target is seen again. ``abort_margin``: sigmas of its best abort. ``led_s``:
-    time of the last tick in which its state and the target's pose were known. ``changes``: log that
-    all chasers share.
+    time of the last tick in which its state and the target's pose were known. ``unseen``: why its
+    last image showed no pose, or empty. ``changes``: log that all chasers share.
     """
 
     def __init__(self, scenario: FlightScenario, number: int, changes: list[PhaseChange]) -> None:
@@ -134,7 +134,8 @@ class ChaserMachine:
         self.nominal_m = np.asarray(scenario.chasers[number].position_m)
         self.dock, self._cone = dock_of(scenario, number), cone_of(scenario, number)
         self.thrusters = ThrusterCommands(scenario.chaser)
-        self.state = ChaserGuidance(Phase.ACQUIRE, 0.0, stay(self.nominal_m, 0.0))
+        first = Phase.SURVEY if scenario.maps_target else Phase.ACQUIRE
+        self.state = ChaserGuidance(first, 0.0, stay(self.nominal_m, 0.0))
         self.position_m: Array | None = None
         self.seen: DockingObservation | None = None
         self.relative: RelativeState | None = None
@@ -142,6 +143,7 @@ class ChaserMachine:
         self.interrupted = False
         self.abort_margin: float | None = None
         self.led_s: float | None = None
+        self.unseen = ""
         self._last_command: tuple[float, OperatorCommand] | None = None
         self._activities: dict[Phase, Activity] = {}
         self._answering: dict[str, Activity] = {}
@@ -239,6 +241,8 @@ class ChaserMachine:
         """
         if self.phase in (Phase.ACQUIRE, Phase.SEARCHING):
             return CommandResult(False, "the target has not been found yet")
+        if self.phase is Phase.SURVEY and not self._is_led(now_s):
+            return CommandResult(False, self.unseen or "the target has not been mapped yet")
         done_s, done = self._last_command or (-math.inf, command)
         differs = (done.command, done.offset_m) != (command.command, command.offset_m)
         if done_s == now_s and differs and command.command != "abort":
@@ -247,6 +251,11 @@ class ChaserMachine:
         if result.accepted:
             self._last_command = now_s, command
         return result
+
+    def _is_led(self, now_s: float) -> bool:
+        """Return whether the target's pose is known, or was for as long as a command lives."""
+        lifetime_s = self.scenario.controller.command_lifetime_s
+        return self.led_s is not None and now_s - self.led_s <= lifetime_s
 
     def _obey(self, command: OperatorCommand, now_s: float) -> CommandResult:
         self.interrupted = False  # a new command cancels the resumption of the one before

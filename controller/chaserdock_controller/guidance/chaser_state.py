@@ -16,7 +16,7 @@ from chaserdock_controller.interfaces import PlanningFailure, RelativePose, Targ
 from .docking import DockingObservation
 from .escape import RelativeState
 from .phases import Phase, Trigger
-from .pointing import SearchProgress
+from .pointing import SearchProgress, SurveyPlace
 from .trajectories import Motion, Slew
 
 
@@ -38,7 +38,8 @@ class ChaserGuidance:
     its estimated pose in TRF when the pull test began. ``faces``: the reference attitude turns with
     the offset so that the chaser faces the target. ``turns``: the body flies the calibration
     manoeuvre. ``stuck``: it is to back out, but its latch does not open.
-    ``search``: progress along the search pattern. ``slew``: turn from where it pointed after a
+    ``search``: progress along the search pattern. ``survey``: where it stays while the target is
+    mapped. ``slew``: turn from where it pointed after a
     pause to the reference attitude.
     """
 
@@ -53,6 +54,7 @@ class ChaserGuidance:
     turns: bool = False
     stuck: bool = False
     search: SearchProgress | None = None
+    survey: SurveyPlace | None = None
     slew: Slew | None = None
 
     def over_at(self, now_s: float) -> bool:

@@ -34,7 +34,7 @@ def resume_after_pause(
     lifetime_s = chaser.scenario.controller.command_lifetime_s
     if led_s is None or now_s - led_s <= lifetime_s or known.offset_m is None:
         return
-    if chaser.phase in (Phase.ACQUIRE, Phase.SEARCHING):
+    if chaser.phase in (Phase.ACQUIRE, Phase.SEARCHING, Phase.SURVEY):
         return  # they have no motion, and search without a known place
     chaser.position_m, chaser.seen, chaser.relative = known.offset_m, known.port, known.relative
     since_s = now_s - max(0.0, led_s - chaser.state.since_s)
@@ -51,6 +51,18 @@ def resume_after_pause(
         chaser.log(f"begins its motion again where it is: {reason}")
     turn_back = _turn_back(chaser, known, moves.speed_m_s(chaser.phase), references)
     chaser.state = replace(chaser.state, slew=turn_back)
+
+
+def lead_from_here(
+    chaser: ChaserMachine, known: ChaserTick, moves: MovePlanner, references: ReferenceBuilder
+) -> None:
+    """Let the motion of a chaser that is not led relative to the target begin where it is and
+    where it points. Call in every tick in which its pose is known.
+    """
+    assert known.offset_m is not None
+    chaser.state = replace(chaser.state, move=stay(known.offset_m, known.now_s), slew=None)
+    turn = _turn_back(chaser, known, moves.goto_m_s, references)
+    chaser.state = replace(chaser.state, slew=turn)
 
 
 def _again(chaser: ChaserMachine, move: Motion, now_s: float, moves: MovePlanner) -> Motion | None:

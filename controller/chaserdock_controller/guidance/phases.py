@@ -15,6 +15,7 @@ class Phase(StrEnum):
 
     ACQUIRE = "acquire"
     SEARCHING = "searching"
+    SURVEY = "survey"
     HOLD = "hold"
     CALIBRATE = "calibrate"
     INSPECT = "inspect"
@@ -120,6 +121,7 @@ TRANSITIONS = (
     Transition((_P.HOLD,), _T.COMMAND_INSPECT, _P.INSPECT),
     Transition((_P.INSPECT,), _T.INSPECTION_COMPLETE, _P.HOLD),
     Transition(_FREE, _T.COMMAND_GOTO, _P.GOTO),
+    Transition((_P.SURVEY,), _T.COMMAND_GOTO, _P.GOTO, by_capture=False),
     Transition((_P.APPROACH, _P.DOCKED), _T.COMMAND_GOTO, _P.GOTO, by_capture=False),
     Transition((_P.WAIT, _P.ALIGN), _T.COMMAND_GOTO, _P.GOTO, by_capture=True),
     Transition(

@@ -139,6 +139,15 @@ def search_wrench(
     return turning_wrench(odometry, body, now, soon)
 
 
+class SurveyPlace(Struct, frozen=True):
+    """Where a chaser stays while an unknown target is mapped: position (3,) and attitude (4,), CRF
+    to WRF, by its odometry.
+    """
+
+    position_m: Array
+    q_wxyz: Array
+
+
 class SearchProgress(Struct, frozen=True):
     """Progress of a chaser's search: the attitude at its beginning, and its pauses.
 

@@ -34,8 +34,11 @@ from .docking import DockingObservation
 from .escape import RelativeState
 from .fleet import ChaserFleet
 from .horizon import ReferenceBuilder
-from .pauses import resume_after_pause
+from .pauses import lead_from_here, resume_after_pause
 from .phases import Phase
+
+_UNLED = (Phase.SEARCHING, Phase.SURVEY)
+"""Phases of chasers that do not fly relative to the target, by commands of their own."""
 
 
 class GuidanceStage:
@@ -76,6 +79,8 @@ class GuidanceStage:
         for chaser, tick in ticks:
             chaser.follow_planning(tick)
 
+        for sighting in observation.sightings:
+            fleet.chasers[sighting.chaser].unseen = sighting.detail
         commands = (*fleet.due_commands(now_s), *observation.commands)
         for activity in self.activities:
             activity.observe(commands, observation, estimation)
@@ -189,6 +194,8 @@ class GuidanceStage:
         """Advance a chaser's phase by its tracking errors and its docking sensor. Returns its
         reference at the start of the tick.
         """
+        if chaser.phase is Phase.SURVEY:
+            lead_from_here(chaser, known, self.fleet.moves, self.references)
         pose = self.references.pose(chaser, known.target, known.now_s)
         error_m = length(pose[0] - own.position_m)
         error_rad = float(rotations.angle_between(pose[1], own.q_wxyz))
@@ -200,7 +207,7 @@ class GuidanceStage:
     ) -> HorizonReference | None:
         """Return the references of the chasers that are planned for; None if there are none."""
         present = [(c, tick) for c, tick in zip(self.chasers, known, strict=True) if tick.own]
-        planned = [c for c, _ in present if c.phase is not Phase.SEARCHING]
+        planned = [c for c, _ in present if c.phase not in _UNLED]
         attached = frozenset(c.number for c, tick in present if c.is_attached(tick))
         # Latched chasers are planned for only while others have to fly around them.
         if estimation.at_effect is None or not planned or len(attached) == len(present):

@@ -122,6 +122,7 @@ class MachineState(Struct, forbid_unknown_fields=True):
     interrupted: bool
     abort_margin: float | None
     led_s: float | None
+    unseen: str
     _last_command: tuple[float, OperatorCommand] | None
 
 

@@ -43,7 +43,7 @@ from chaserdock_controller.estimation.types import MeasuredChaser, Shock
 from chaserdock_controller.guidance.detumble.planner import ActivePlan, PlanSearch
 from chaserdock_controller.guidance.detumble.planning import StackPlan, StackProblem
 from chaserdock_controller.guidance.docking import DockingObservation
-from chaserdock_controller.guidance.pointing import SearchProgress
+from chaserdock_controller.guidance.pointing import SearchProgress, SurveyPlace
 from chaserdock_controller.guidance.trajectories import Circuit, Escape, Glide, Move, Part, Slew
 from chaserdock_controller.ingest.odometry_validation import Known
 from chaserdock_controller.interfaces import AppliedImpulse, ChaserPlan, RelativePose
@@ -69,6 +69,7 @@ ARRAYS: dict[type, dict[str, tuple[ArrayShape, ...]]] = {
     Escape: {"state": (_6,), "acceleration_m_s2": (_3,)},
     Circuit: {"from_m": (_3,), "axis": (_3,)},
     SearchProgress: {"q_start_wxyz": (_4,)},
+    SurveyPlace: {"position_m": (_3,), "q_wxyz": (_4,)},
     Slew: {"turn_rad": (_3,)},
     DockingObservation: {"offset_m": (_3,), "q_wxyz": (_4,), "covariance": ((6, 6),)},
     RelativePose: {

@@ -148,6 +148,7 @@ def open_mission(
         commands,
         options.recorder_expected,
         scenario.controller.standby,
+        scenario.maps_target,
     )
     barrier.faults = faults
     return MissionHost(scenario, options, node, barrier, membership.run_id)

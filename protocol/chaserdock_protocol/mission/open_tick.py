@@ -15,8 +15,8 @@ from chaserdock_protocol.messages import Tick
 class OpenTick:
     """A tick that expects a reply of ``chasers``.
 
-    ``revision``: how often it was published again. ``controllers``, ``instances`` (of chasers) and
-    ``since``: see ``Tick``.
+    ``revision``: how often it was published again. ``controllers``, ``instances`` (of chasers),
+    ``since`` and ``mapper``: see ``Tick``.
     """
 
     tick: int = -1
@@ -25,6 +25,7 @@ class OpenTick:
     controllers: dict[str, str] = field(default_factory=dict)
     instances: Mapping[str, str] = field(default_factory=dict)
     since: dict[str, int] = field(default_factory=dict)
+    mapper: str = ""
     revision: int = 0
     replied: set[int] = field(default_factory=set)
 
@@ -36,6 +37,9 @@ class OpenTick:
     def remove(self, process: str) -> bool:
         """Stop expecting a reply of a lost process; return whether it took part."""
         self.since.pop(process, None)
+        if process == "mapper" and self.mapper:
+            self.mapper = ""
+            return True
         if self.controllers.pop(process, None) is not None:
             return True
         before = self.chasers
@@ -55,4 +59,5 @@ class OpenTick:
                 name: self.instances[name] for name in map("chaser/{}".format, self.chasers)
             },
             since=self.since,
+            mapper=self.mapper,
         )

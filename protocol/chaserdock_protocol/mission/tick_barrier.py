@@ -61,6 +61,7 @@ class TickBarrier:
         commands: CommandIntake,
         recorder_expected: bool,
         standby_expected: bool = False,
+        mapper_expected: bool = False,
     ) -> None:
         self.faults: FaultLayer | None = None
         self.take_other: Callable[[Message], None] = lambda message: None
@@ -70,7 +71,7 @@ class TickBarrier:
         self._heartbeat = heartbeat
         self._timing = timing
         self._commands = commands
-        self._standby_expected = standby_expected
+        self._standby_expected, self._mapper_expected = standby_expected, mapper_expected
         self._recorder_expected = self._recorder_configured = recorder_expected
         self._recorded_tick = -1
         self._open = OpenTick()
@@ -92,6 +93,7 @@ class TickBarrier:
             *self._commands.names,
             "controller",
             *(["standby"] if self._standby_expected else []),
+            *(["mapper"] if self._mapper_expected else []),
         ]
         expected += ["recorder"] if self._recorder_expected else []
         connected = self._connected()
@@ -111,10 +113,12 @@ class TickBarrier:
         chasers = self._chasers_among(connected)
         controllers = {n: instance_of(n) for n in topics.CONTROLLERS if n in connected}
         instances = {f"chaser/{i}": instance_of(f"chaser/{i}") for i in chasers}
-        since = {n: self._open.since.get(n, tick) for n in (*instances, *controllers)}
+        mapper = instance_of("mapper") if "mapper" in connected else ""
+        taking_part = (*instances, *controllers, *(["mapper"] if mapper else []))
+        since = {n: self._open.since.get(n, tick) for n in taking_part}
         # A recorder that returns paces the flight again.
         self._recorder_expected |= self._recorder_configured and "recorder" in connected
-        self._open = OpenTick(tick, images, chasers, controllers, instances, since)
+        self._open = OpenTick(tick, images, chasers, controllers, instances, since, mapper)
         if self.faults is not None:
             for what, detail in self.faults.transitions_at(tick):
                 self.publish_warning(what, detail)

@@ -13,7 +13,13 @@ from chaserdock_models.decimation import simplified
 from chaserdock_models.meshes import TriangleMesh, mass_properties, without_parts
 from chaserdock_models.satellites import FINE_M, satellite
 from chaserdock_models.shape_distance import chaser_boxes
-from chaserdock_models.targets import Box, TargetModel, target_model, target_names
+from chaserdock_models.targets import (
+    UNKNOWN_TARGET,
+    Box,
+    TargetModel,
+    target_model,
+    target_names,
+)
 from chaserdock_models.thruster_bodies import BODIES
 from pydantic import Field, model_validator
 
@@ -183,6 +189,10 @@ class FlightTarget(Section):
             return self.geometry.nominal_mesh(self.model, tolerance_m)
         return satellite(self.model, tolerance_m) if self.shape().satellite else None
 
+    def as_unknown(self) -> FlightTarget:
+        """Return the target of flight software that knows neither shape nor mass properties."""
+        return FlightTarget(model=UNKNOWN_TARGET, motion=self.motion)
+
     def as_known(self) -> FlightTarget:
         """Return the target as the flight software knows it.
 
@@ -253,6 +263,15 @@ class Target(FlightTarget, Oriented):
         default=(0.015, 0.045, 0.03),
         description="Initial angular velocity (TRF), rad/s. Ignored by `static`.",
     )
+
+    @model_validator(mode="after")
+    def _has_a_shape(self) -> Target:
+        if self.model == UNKNOWN_TARGET:
+            raise ValueError(
+                f"model: {UNKNOWN_TARGET!r} is what flight software gets with perception.name = "
+                '"features"; the world needs a shape'
+            )
+        return self
 
 
 def _check_inertia(i: tuple[float, float, float]) -> None:

@@ -28,6 +28,7 @@ from chaserdock_models.shape_distance import (
 from chaserdock_models.wrench_set import wrench_matrix
 from numpy.typing import ArrayLike
 
+from .bodies import FlightTarget
 from .faults import check_faults
 from .mounting import nominal_mounting, plume_free_thrusters
 from .planar import check_planar, check_planar_flight, up_in_target
@@ -324,11 +325,32 @@ def _check_mesh_file(scenario: Scenario, geometry: Geometry) -> None:
 
 
 def _check_perception(scenario: FlightScenario) -> None:
+    if scenario.maps_target:
+        _check_unknown_target(scenario)
     if scenario.perception.name in MARKER_PERCEPTIONS and not scenario.target_model().markers:
         raise ValueError(
             f"perception.name: {scenario.perception.name!r} needs markers; the target "
             f"{scenario.target.model!r} has none"
         )
+
+
+def _check_unknown_target(scenario: FlightScenario) -> None:
+    """Check that flight software that maps its target is told nothing of its shape, and that the
+    mission needs nothing of it.
+    """
+    is_flight = type(scenario.target) is FlightTarget
+    if is_flight and scenario.target != scenario.target.as_unknown():
+        raise ValueError(
+            "target: flight software that maps a target may know nothing of it but its motion model"
+        )
+    if scenario.target.motion == "torque_free":
+        raise ValueError('target.motion: perception.name = "features" maps constant rates only')
+    if scenario.docking.kind == "capture":
+        raise ValueError('docking.kind: "capture" needs the shape of the target at its ports')
+    if scenario.mapping.latency_s * scenario.time.image_hz < 1.0 - 1e-9:
+        raise ValueError("mapping.latency_s: shorter than the interval of the images")
+    if scenario.limits.min_distance_shape_m:
+        raise ValueError("limits.min_distance_shape_m: the shape of the target is unknown")
 
 
 def _check_named_chasers(scenario: FlightScenario) -> None:

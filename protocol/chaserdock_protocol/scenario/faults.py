@@ -82,8 +82,8 @@ def _signature(required: str, optional: str, roles: str) -> _Signature:
 
 _ALL_BUT_RECORDER = "world controller chaser"
 _SIGNATURES: dict[str, _Signature] = {
-    "kill": _signature("", "", "controller chaser recorder"),
-    "freeze": _signature("duration_s", "", "world controller chaser recorder"),
+    "kill": _signature("", "", "controller chaser mapper recorder"),
+    "freeze": _signature("duration_s", "", "world controller chaser mapper recorder"),
     "cut": _signature("duration_s", "peer", "controller chaser"),
     "drop": _signature("duration_s topic", "share peer", _ALL_BUT_RECORDER),
     "delay": _signature("duration_s topic delay_s", "peer", _ALL_BUT_RECORDER),
@@ -112,7 +112,7 @@ def _check_process_name(name: str) -> str:
     if not topics.is_member_name(name) or name == "operator":
         raise ValueError(
             f"{name!r} is no process of a mission; valid: world, controller, standby, "
-            "chaser/NUMBER, recorder"
+            "chaser/NUMBER, mapper, recorder"
         )
     return name
 
@@ -130,10 +130,10 @@ class Fault(Section):
         description="Duration, s of mission time; of wall time for `freeze`. `kill` has none.",
     )
     process: Process = Field(
-        description="Process that is affected: `world`, `controller`, `standby`, `chaser/NUMBER` "
-        "or `recorder`. Faults of messages affect what it receives; `flood`, `clock_jump`, "
-        "`lying_sensor` and `odometry_lie` what it publishes; `latch_slip`, `latch_open` and "
-        "`latch_stuck` its latch."
+        description="Process that is affected: `world`, `controller`, `standby`, "
+        "`chaser/NUMBER`, `mapper` or `recorder`. Faults of messages affect what it receives; "
+        "`flood`, `clock_jump`, `lying_sensor` and `odometry_lie` what it publishes; "
+        "`latch_slip`, `latch_open` and `latch_stuck` its latch."
     )
     peer: Process | None = Field(
         default=None, description="Limits the fault to messages from this process."
@@ -276,6 +276,10 @@ def check_faults(faults: tuple[Fault, ...], scenario: Scenario) -> None:
         for name in (fault.process, fault.peer or "world"):
             if name == "standby" and not scenario.controller.standby:
                 raise ValueError(f"fault.{k}: a standby exists only with controller.standby = true")
+            if name == "mapper" and not scenario.maps_target:
+                raise ValueError(
+                    f'fault.{k}: a mapper exists only with perception.name = "features"'
+                )
             head, _, number = name.partition("/")
             if head == "chaser" and int(number) >= chasers:
                 raise ValueError(

@@ -26,12 +26,14 @@ from .docking import Docking
 from .errors import invalid
 from .fields import MAX_CHASERS, Name, Section
 from .inspection import Inspection
+from .mapping import Mapping
 from .migrations import FORMAT
 from .navigation import NavigationSection
 from .orbit import Orbit
 from .plume import PlumeSection
 from .ranging import Ranging
 from .schema import (
+    MAPPING,
     MAX_DURATION_S,
     Approach,
     Controller,
@@ -77,6 +79,7 @@ class FlightScenario(Section):
     navigation: NavigationSection = NavigationSection()
     ranging: Ranging | None = None
     perception: PerceptionSection = PerceptionSection()
+    mapping: Mapping = Mapping()
     estimator: EstimatorSection = EstimatorSection()
     controller: Controller = Controller()
     limits: Limits = Limits()
@@ -105,6 +108,11 @@ class FlightScenario(Section):
             time.physics_hz, time.rate_hz, time.image_hz, round(time.latency_s * time.physics_hz)
         )
 
+    @property
+    def maps_target(self) -> bool:
+        """Whether the target's shape is unknown to the flight software, which maps it."""
+        return self.perception.name == MAPPING
+
     def camera_model(self) -> Camera:
         """Return the camera as calibrated."""
         return self.camera.model()
@@ -131,7 +139,8 @@ def flight_scenario(scenario: FlightScenario) -> FlightScenario:
 def flight_scenario_json(scenario: FlightScenario) -> str:
     """Return the JSON of the flight scenario of a scenario."""
     # Serialized by the declared types, which leaves out the fields of their subclasses.
-    known = scenario.target.as_known()
+    target = scenario.target
+    known = target.as_unknown() if scenario.maps_target else target.as_known()
     if known is not scenario.target:
         scenario = scenario.model_copy(update={"target": known})
     return _FLIGHT.dump_json(scenario).decode()

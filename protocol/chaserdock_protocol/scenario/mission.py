@@ -17,6 +17,7 @@ from .faults import Fault
 from .fields import MAX_CHASERS, Index, NotNegative, Positive, Section, Vector
 from .flight import FlightScenario
 from .lab import LabSection, check_lab
+from .mapping import MapLimits
 from .rendezvous import Arrival, ConeLimit, SpeedLimit
 from .schema import FlightChaser
 from .simulation import SimulationSection
@@ -70,6 +71,7 @@ class Success(Section):
         description="Rates that the stack of target and latched chasers must not exceed at the "
         "end.",
     )
+    map: MapLimits | None = None
     speed_limit: SpeedLimit | None = None
     approach_cone: ConeLimit | None = None
     arrival: Arrival | None = None

@@ -28,7 +28,9 @@ from .fields import (
 )
 
 MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
-PERCEPTIONS = (*MARKER_PERCEPTIONS, "model")
+MAPPING = "features"
+"""Perception that knows nothing of the target's shape."""
+PERCEPTIONS = (*MARKER_PERCEPTIONS, "model", MAPPING)
 ESTIMATORS = ("joint", "paper")
 SOLVERS = ("rti", "ipopt", "open")
 """Names of the built-in parts that a scenario selects. Further ones may be installed (``plugins``).
@@ -104,7 +106,8 @@ class PerceptionSection(Section):
         default="default",
         description="`default`, `paper` (the paper's method, with EPnP), `paper_iterative` (the "
         "same with OpenCV's iterative PnP, as in the authors' public code), `model` (by the "
-        "target's shape, without markers: [markerless.md](markerless.md)), `statistical` (no "
+        "target's shape, without markers: [markerless.md](markerless.md)), `features` (nothing is "
+        "known of the target: [unknown-target.md](unknown-target.md)), `statistical` (no "
         "images: measurements are drawn around the true pose, "
         "[simulation.md](simulation.md)), or an installed plugin.",
     )

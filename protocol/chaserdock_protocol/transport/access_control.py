@@ -60,7 +60,15 @@ def identities(chasers: int) -> tuple[Identity, ...]:
     """Return all processes that may connect to the router of a mission with at most ``chasers``
     chasers.
     """
-    single: tuple[Role, ...] = ("world", "recorder", "operator", "analysis", "viewer", "bridge")
+    single: tuple[Role, ...] = (
+        "world",
+        "mapper",
+        "recorder",
+        "operator",
+        "analysis",
+        "viewer",
+        "bridge",
+    )
     return (
         *(Identity(role, role) for role in single),
         *(Identity(name, "controller") for name in topics.CONTROLLERS),

@@ -74,6 +74,11 @@ def named_perception(
             perception = ModelPerception(camera, tracker_mesh(target), single_images=single_images)
             perception.prepare()
             return perception
+        case "features":
+            raise plugins.PluginError(
+                "perception 'features' maps a target in a mission only; it gives no poses of "
+                "single images"
+            )
         case _:
             return plugins.make("perception", name, PERCEPTIONS, camera, target.shape())
 

@@ -14,6 +14,7 @@ from .hold import HoldActivity
 from .inspect import InspectActivity
 from .retreat import RetreatActivity
 from .search import SearchActivity
+from .survey import SurveyActivity
 
 
 def activities_of(fleet: ChaserFleet) -> tuple[Activity, ...]:
@@ -21,6 +22,7 @@ def activities_of(fleet: ChaserFleet) -> tuple[Activity, ...]:
     return (
         HoldActivity(),
         SearchActivity(fleet.scenario),
+        SurveyActivity(),
         GotoActivity(fleet),
         ApproachActivity(),
         DockingActivity(fleet),

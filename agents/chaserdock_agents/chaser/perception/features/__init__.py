@@ -5,15 +5,20 @@ from __future__ import annotations
 
 from .description import PointDescriptions, describe
 from .memory import KnownTarget, SupposedMotion
+from .pose import MapPoseTuning, NoMapPose, SeenLandmarks, pose_by_map
 from .tracker import BYTES_PER_POINT, FeatureTracker, TrackedPoints, TrackingTuning
 
 __all__ = [
     "BYTES_PER_POINT",
     "FeatureTracker",
     "KnownTarget",
+    "MapPoseTuning",
+    "NoMapPose",
     "PointDescriptions",
+    "SeenLandmarks",
     "SupposedMotion",
     "TrackedPoints",
     "TrackingTuning",
     "describe",
+    "pose_by_map",
 ]

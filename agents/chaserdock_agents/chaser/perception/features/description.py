@@ -15,12 +15,10 @@ import cv2
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.camera import Camera
+from chaserdock_protocol.messages import DESCRIPTION_BYTES
 from numpy.typing import NDArray
 
 from ..refine import PoseInCamera
-
-DESCRIPTION_BYTES = 128
-"""Size of one description: 4 x 4 cells, 8 directions."""
 
 
 @dataclass(frozen=True)

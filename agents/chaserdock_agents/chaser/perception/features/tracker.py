@@ -4,7 +4,8 @@
 Points are found in reference images and followed from the last of these to each image by pyramidal
 Lucas-Kanade, forward and back. Errors therefore add up from reference to reference only, not from
 image to image. A point is published once it has moved against the stars as well as against the
-image: stars, the Earth and the chaser's own probe never do.
+image: stars, the Earth and the chaser's own probe never do. Once the target is known, to move
+against the stars is enough, as a chaser may turn with it; its own body is then to be excluded.
 """
 
 from __future__ import annotations
@@ -127,7 +128,7 @@ class FeatureTracker:
         equalized = np.asarray(self._equalize.apply(image), dtype=np.uint8)
         self._follow(equalized)
         self._drop_excluded(excluded)
-        self._tell_background(q_w_irf_wxyz)
+        self._tell_background(q_w_irf_wxyz, known is not None)
         self._age += 1
         share = len(self._ids) / max(self._referenced, 1)
         if (
@@ -179,16 +180,18 @@ class FeatureTracker:
         if inside.any():
             self._keep(~inside)
 
-    def _tell_background(self, q_w_irf_wxyz: ArrayLike) -> None:
+    def _tell_background(self, q_w_irf_wxyz: ArrayLike, known: bool) -> None:
         """Mark the points that have moved against the image and the stars; give up those that have
-        not for long.
+        not for long. Of a ``known`` target, with which the chaser may turn, motion against the
+        stars is enough.
         """
         tuning = self.tuning
         ideal = self.camera.undistort(self._px)
         stars = self.camera.project_ideal(rotations.rotate_inverse(q_w_irf_wxyz, self._birth_w))
         by_image = np.linalg.norm(ideal - self._birth_px, axis=1)
         by_stars = np.linalg.norm(ideal - stars, axis=1)
-        self._moves |= (by_image > tuning.moved_px) & (by_stars > tuning.moved_px)
+        moved_here = known | (by_image > tuning.moved_px)
+        self._moves |= moved_here & (by_stars > tuning.moved_px)
         self._still_left = self._still_left - 1
         still = ~self._moves & (self._images >= tuning.still_images)
         left = self._still_left > 0

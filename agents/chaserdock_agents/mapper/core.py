@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Collect the points that chasers follow, and map the target when that is due. No I/O.
+
+In lock-step a map is made of all images up to its tick, by all chasers that take part in it, so
+that nothing depends on the order of arrival.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import msgspec
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_protocol import topics
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import (
+    AGE_STEP_S,
+    DESCRIPTION_BYTES,
+    MAX_COUNT,
+    PX_STEP,
+    Event,
+    FeatureTracks,
+    KnownTracks,
+    LandmarkMap,
+    MappedMotion,
+    MapStatus,
+    Message,
+    Tick,
+)
+from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.topics import Topic
+
+from .frame import MapFrame
+from .mapper import MAP_STATUS, Mapper, TargetMap
+from .types import CameraUncertainty, ImageTracks
+
+HELP: dict[MapStatus, str] = {
+    "gathering": "wait; views must span some seconds",
+    "no texture": "too few points: a light, a nearer place, or another side may help",
+    "does not turn": "the points hardly move: another view, or a longer inspection, may help",
+    "ambiguous": "two motions explain the images alike: a longer inspection, or a second side",
+    "inconsistent": "no motion explains the images: a longer inspection, or less glare",
+    "scale unknown": "one camera tells no distances: a second chaser beside it would; no approach",
+    "mapped": "",
+}
+"""What each status means for an operator."""
+
+_AHEAD_TICKS = 8
+"""Most ticks by which a chaser may know of a tick earlier than this process, as in the controller;
+messages that claim more are dropped."""
+
+
+class TrackCollector:
+    """Brings the tracks of all chasers into the order of time.
+
+    ``ready``: tracks to map, in order; taken by the one who maps. ``stale``: messages dropped.
+    """
+
+    def __init__(self, scenario: FlightScenario, realtime: bool) -> None:
+        self.ready: deque[FeatureTracks] = deque()
+        self.stale = 0
+        self.tick: Tick | None = None
+        self._timing, self._realtime = scenario.timing, realtime
+        self._chasers = len(scenario.chasers)
+        self._open: dict[int, tuple[int, ...]] = {}
+        self._early: dict[int, dict[int, FeatureTracks]] = {}
+        self._newest: dict[int, int] = {}
+        self.complete_tick = -1
+        """Newest tick with images that is ready."""
+
+    def add_tick(self, tick: Tick) -> None:
+        """Take the begin of a tick, or a correction of who takes part in it."""
+        known = self.tick
+        if known is not None and (tick.tick, tick.revision) < (known.tick, known.revision):
+            return
+        self.tick = tick
+        if not self._realtime:
+            # Who has left owes no tracks of earlier images, either.
+            self._open = {
+                k: tuple(i for i in who if i in tick.chasers) for k, who in self._open.items()
+            }
+            if tick.images:
+                self._open[tick.tick] = tick.chasers
+            self._release()
+            return
+        # In real time an image counts that has arrived before the next one.
+        before = tick.tick - self._timing.ticks_per_image
+        self.complete_tick = max(self.complete_tick, before - before % self._timing.ticks_per_image)
+
+    def add(self, tracks: FeatureTracks) -> None:
+        """Take the tracks of one image."""
+        tick, newest = -1 if self.tick is None else self.tick.tick, self._newest
+        if (
+            tracks.chaser >= self._chasers
+            or not _is_whole(tracks)
+            or tracks.tick <= newest.get(tracks.chaser, -1)
+            or tracks.tick > tick + _AHEAD_TICKS
+        ):
+            self.stale += 1
+            return
+        newest[tracks.chaser] = tracks.tick
+        if self._realtime:
+            self.ready.append(tracks)
+        elif tracks.tick <= self.complete_tick:
+            self.stale += 1
+        else:
+            self._early.setdefault(tracks.tick, {})[tracks.chaser] = tracks
+            self._release()
+
+    def missing_keys(self) -> tuple[str, ...]:
+        """Return the keys of the tracks that the oldest open image lacks; of the next tick if there
+        is none.
+        """
+        for tick, chasers in sorted(self._open.items()):
+            arrived = self._early.get(tick, {})
+            return tuple(topics.FEATURES.key_of(i) for i in chasers if i not in arrived)
+        return (topics.TICK.key_of(),)
+
+    def _release(self) -> None:
+        for tick in sorted(self._open):
+            arrived = self._early.get(tick, {})
+            if not all(i in arrived for i in self._open[tick]):
+                return
+            del self._open[tick]
+            for early in sorted(k for k in self._early if k <= tick):
+                found = self._early.pop(early)
+                self.ready.extend(found[i] for i in sorted(found))
+            self.complete_tick = tick
+
+
+class MapperCore:
+    """Map the target of a scenario. Equal messages give equal maps.
+
+    ``instance``: of the process. `step` may run beside `map_target`, which one thread calls.
+    """
+
+    def __init__(
+        self, scenario: FlightScenario, realtime: bool = False, instance: str = ""
+    ) -> None:
+        self.scenario, self.instance = scenario, instance
+        self.collector = TrackCollector(scenario, realtime)
+        camera, errors = scenario.camera_model(), scenario.navigation.errors()
+        uncertainty = CameraUncertainty(
+            errors.camera_turn_rad,
+            errors.camera_shift_m,
+            errors.camera_focal_share,
+            errors.attitude_noise_rad,
+            errors.position_noise_m,
+        )
+        self.mapper = Mapper([uncertainty] * len(scenario.chasers), camera.fx_px)
+        self._camera, self._frame = camera, MapFrame()
+        self._status: MapStatus | None = None
+        self._next_tick = 0
+
+    def step(self, message: Message) -> int | None:
+        """Take a message; return the tick of a map that is due now, or None."""
+        match message:
+            case Tick():
+                self.collector.add_tick(message)
+            case FeatureTracks():
+                self.collector.add(message)
+            case _:
+                return None
+        tick = self.collector.complete_tick
+        if tick < 0 or tick < self._next_tick:
+            return None
+        self._next_tick = MAX_COUNT  # until the map is made
+        return tick
+
+    def map_target(self, tick: int) -> list[tuple[Topic, str | None, Message]]:
+        """Return what to publish of a map from all tracks up to ``tick``."""
+        ready, timing = self.collector.ready, self.scenario.timing
+        while ready and ready[0].tick <= tick:
+            self._add(ready.popleft())
+        time_ns = timing.tick_time_ns(tick)
+        found = self.mapper.update(time_ns / 1e9)
+        mapped, section = found.status in MAP_STATUS, self.scenario.mapping
+        period_s = section.period_s if mapped else section.first_period_s
+        images = max(1, round(period_s * timing.image_hz))
+        self._next_tick = tick + images * timing.ticks_per_image
+        message = self._message(found, tick, time_ns)
+        out: list[tuple[Topic, str | None, Message]] = [(topics.MAP, None, message)]
+        if found.status != self._status:
+            self._status = found.status
+            out.append((topics.EVENT, "mapper", _event(message)))
+        return out
+
+    def _add(self, message: FeatureTracks) -> None:
+        px = np.array(message.places, dtype=float).reshape(-1, 2) * PX_STEP
+        time_s, ids = message.sim_time_ns / 1e9, np.array(message.ids, dtype=np.int64)
+        self.mapper.add(
+            ImageTracks(
+                message.chaser,
+                time_s,
+                np.array(message.position_m),
+                rotations.to_matrix(message.q_wxyz),
+                ids,
+                self._camera.normalized(px),
+                np.array(message.ages, dtype=float) * AGE_STEP_S,
+            )
+        )
+        if message.described:
+            values = np.frombuffer(message.descriptions, dtype=np.uint8)
+            self.mapper.describe(
+                message.chaser,
+                time_s,
+                np.array(message.described, dtype=np.int64),
+                values.reshape(-1, DESCRIPTION_BYTES),
+            )
+
+    def _message(self, found: TargetMap, tick: int, time_ns: int) -> LandmarkMap:
+        message = LandmarkMap(
+            tick=tick,
+            sim_time_ns=time_ns,
+            status=found.status,
+            next_tick=self._next_tick,
+            instance=self.instance,
+        )
+        if found.motion is None:
+            return message
+        landmarks = self._frame.align(found.keys, found.landmarks_m, found.motion.omega_rad_s)
+        m = self._frame.motion_at(found.motion, found.covariance, time_ns / 1e9)
+        moments = self._frame.moments(found.covariances_m2)
+        return msgspec.structs.replace(
+            message,
+            motion=MappedMotion(
+                position_m=vector(m.position_m),
+                velocity_m_s=vector(m.velocity_m_s),
+                q_wxyz=vector(m.q_wxyz),
+                omega_rad_s=vector(m.omega_rad_s),
+                covariance=vector(m.covariance),
+            ),
+            landmarks_m=vector(landmarks),
+            moments_m2=vector(moments[:, (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]),
+            tracks=tuple(self._tracks(i) for i in range(len(self.scenario.chasers))),
+            scale_share=found.scale_share,
+            residual_px=found.residual_px,
+            merges=found.merges,
+        )
+
+    def _tracks(self, chaser: int) -> KnownTracks:
+        ids, rows = (part[-_MOST_KNOWN:] for part in self.mapper.known_tracks(chaser))
+        return KnownTracks(chaser=chaser, ids=tuple(ids.tolist()), landmarks=tuple(rows.tolist()))
+
+
+_MOST_KNOWN = 10_000
+"""Tracks of a chaser that a map names, the newest: the limit of ``KnownTracks``."""
+
+
+def _is_whole(tracks: FeatureTracks) -> bool:
+    """Return whether the fields of a message fit together."""
+    n = len(tracks.ids)
+    return (
+        len(tracks.places) == 2 * n
+        and len(tracks.ages) == n
+        and all(a < b for a, b in zip(tracks.ids, tracks.ids[1:], strict=False))
+        and len(tracks.descriptions) == DESCRIPTION_BYTES * len(tracks.described)
+        and set(tracks.described) <= set(tracks.ids)
+    )
+
+
+def _event(message: LandmarkMap) -> Event:
+    """Return the event of a new status."""
+    detail = HELP[message.status]
+    if message.motion is not None:
+        rate_deg_s = float(np.rad2deg(np.linalg.norm(message.motion.omega_rad_s)))
+        known = (
+            f"{len(message.landmarks_m) // 3} landmarks, {rate_deg_s:.3f} deg/s, "
+            f"scale {100.0 * message.scale_share:.2g} %"
+        )
+        detail = f"{known}; {detail}" if detail else known
+    return Event(
+        tick=message.tick,
+        sim_time_ns=message.sim_time_ns,
+        process="mapper",
+        level="info" if message.status in ("gathering", "mapped") else "warning",
+        what=f"map of the target: {message.status}",
+        detail=detail,
+    )

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mapping of a target of unknown shape (docs/unknown-target.md)."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from .fields import Positive, Section
+
+Seconds = Annotated[float, Field(ge=0.2, le=60, allow_inf_nan=False)]
+
+
+class MapLimits(Section):
+    """What the mapper must achieve with a target of unknown shape; the last map must have
+    distances.
+    """
+
+    within_s: Positive = Field(
+        default=15.0, description="Time of the images of the first map at the latest, s."
+    )
+    rate_percent: Positive = Field(
+        default=1.0, description="Largest error of the rate vector of the last map, %."
+    )
+
+
+class Mapping(Section):
+    """Work of the mapper with `perception.name = "features"`."""
+
+    first_period_s: Seconds = Field(
+        default=1.0, description="Interval of attempts at a first map, s, rounded to images."
+    )
+    period_s: Seconds = Field(
+        default=6.0,
+        description="Interval of improvements of a map, s, rounded to images. Each takes 0.5 to "
+        "3 s of processor time.",
+    )
+    latency_s: Seconds = Field(
+        default=4.0,
+        description="Age at which a map begins to count, s: longer than the work on it, so that "
+        "in lock-step no tick waits.",
+    )

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flights beside a target of which the flight software knows nothing, in virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from chaserdock_protocol.messages import (
+    Event,
+    FeatureTracks,
+    LandmarkMap,
+    Message,
+    Sighting,
+    TargetEstimate,
+    Tick,
+)
+from chaserdock_protocol.recording.log import read_log
+from source_tree import ROOT
+
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import summary_of
+from chaserdock.simulation.mission import SimulatedFlight, simulate
+from chaserdock.summary import Summary
+
+PATH = ROOT / "scenarios/unknown-inspection.toml"
+SHORTER = ("duration_s=14.0", "settling_s=11.0")
+
+
+def flown(folder: Path, *more: str) -> SimulatedFlight:
+    return simulate(PATH, folder, (*SHORTER, *more))
+
+
+def messages(flight: SimulatedFlight) -> Iterator[Message]:
+    for record in read_log(flight.folder):
+        yield record.message
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> SimulatedFlight:
+    return flown(tmp_path_factory.mktemp("unknown") / "run")
+
+
+@pytest.mark.slow(0.1)
+def test_the_target_is_mapped_and_then_seen_by_the_map(flight: SimulatedFlight) -> None:
+    assert not flight.crashes
+    assert not flight.stalled
+    assert set(flight.statuses.values()) == {0}
+    maps = [m for m in messages(flight) if isinstance(m, LandmarkMap)]
+    first = next(m for m in maps if m.status == "mapped")
+    assert first.tick <= 15 * 8
+    # A map counts four seconds after its images, and not before.
+    for m in messages(flight):
+        if isinstance(m, Sighting):
+            counts = m.tick >= first.tick + 60
+            assert bool(m.solutions) == counts or (counts and m.detail)
+            assert counts or m.detail.startswith("no map of the target: ")
+    shown = [m for m in messages(flight) if isinstance(m, Sighting) and m.solutions]
+    assert len(shown) > 20
+    last = [m for m in messages(flight) if isinstance(m, TargetEstimate)][-1]
+    assert last.status == "tracking"
+
+
+@pytest.mark.slow(0.1)
+def test_messages_of_the_mapper_are_bounded(flight: SimulatedFlight) -> None:
+    tracks = [m for m in messages(flight) if isinstance(m, FeatureTracks)]
+    assert len(tracks) == 2 * 14 * 5
+    assert max(len(m.ids) for m in tracks) <= 400
+
+
+@pytest.mark.slow(0.1)
+def test_its_figures_are_judged(flight: SimulatedFlight) -> None:
+    result = summary_of(load_flight(flight.folder))
+    assert Summary.from_dict(result).mapping is not None
+    mapping = result["mapping"]
+    assert mapping["status"] == "mapped"
+    assert 0.0 < mapping["rate_error_share"] < 0.05
+    assert mapping["landmarks"] > 50
+    rows = {row["name"]: row for row in result["criteria"]}
+    assert rows["first map at"]["outcome"] == "met"
+    assert rows["rate error of the last map"]["unit"] == "%"
+    estimate = result["target_estimate"]
+    assert estimate["position_rms_m"] < 0.05
+    # The survey is no motion relative to the target.
+    assert result["chasers"]["0"]["steady"]["position_mse_m2"] is None
+
+
+@pytest.mark.slow(0.5)
+def test_equal_flights_are_equal(flight: SimulatedFlight, tmp_path: Path) -> None:
+    one, other = load_flight(flight.folder), load_flight(flown(tmp_path / "run").folder)
+    assert one.digest == other.digest
+
+
+@pytest.mark.slow(0.5)
+def test_a_flight_goes_on_without_its_mapper(tmp_path: Path) -> None:
+    kill = 'fault=[{kind = "kill", process = "mapper", at_s = 6.0}]'
+    without = flown(tmp_path / "run", kill)
+    assert not without.stalled
+    assert without.statuses["mapper"] is None
+    found = list(messages(without))
+    assert any(isinstance(m, Event) and m.what == "process lost" for m in found)
+    ticks = [m for m in found if isinstance(m, Tick)]
+    assert ticks[0].mapper
+    assert not ticks[-1].mapper
+    assert ticks[-1].tick == 14 * 15 - 1
+    # The last map counts on.
+    assert any(isinstance(m, Sighting) and m.solutions and m.tick > 190 for m in found)

@@ -734,11 +734,11 @@ def unknown() -> None:
     tracks: FeatureTracks | None = None
     for record in read_log(logs / "unknown-approach" / "run"):
         message = record.message
-        if isinstance(message, Image | FeatureTracks) and message.sim_time_ns == round(at_s * 1e9):
-            if message.chaser == 0 and isinstance(message, Image):
-                image = message
-            elif message.chaser == 0:
-                tracks = message
+        at = message.sim_time_ns == round(at_s * 1e9)
+        if at and isinstance(message, Image) and message.chaser == 0:
+            image = message
+        elif at and isinstance(message, FeatureTracks) and message.chaser == 0:
+            tracks = message
     assert image is not None
     assert isinstance(tracks, FeatureTracks)
     newest = [m for m in f.maps if m.sim_time_ns <= tracks.sim_time_ns][-1]

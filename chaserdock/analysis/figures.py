@@ -7,7 +7,7 @@ the flight is judged against, as in ``summary``. A chaser has the same colour in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -353,6 +353,7 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
     errors = {i: table.T for i, table in flight.estimated_errors.items()}
     if flight.shown or not errors:
         errors = {i: tracking_errors(flight, i) for i in flown(flight)}
+    _require_led(errors)
     figure, panels = _timed_figure(flight, 2, 2)
     s = flight.scenario
     position_mm, angle_deg = s.success.steady_position_rms_m, s.success.steady_orientation_rms_deg
@@ -396,6 +397,12 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+def _require_led(errors: Mapping[int, Sequence[Any]]) -> None:
+    """Raise MissingData if no chaser has times (K,), the first of its values, with an error."""
+    if not any(len(time_s) for time_s, *_ in errors.values()):
+        raise MissingData("no chaser was led relative to the target")
+
+
 @_figure(
     "Tracking errors by axis",
     "Pose of each chaser minus its reference pose on the true target: position in target axes, "
@@ -405,9 +412,10 @@ def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     figure, axes = new_figure(2, 3, height=1.7, sharex=True, sharey="row")
     step = decimation(len(flight.motion[TARGET].time_s))
+    errors = {i: tracking_components(flight, i, step) for i in numbers}
+    _require_led(errors)
     reach = np.zeros(2)
-    for i in numbers:
-        time_s, position, turn = tracking_components(flight, i, step)
+    for i, (time_s, position, turn) in errors.items():
         for row, values in enumerate((position * 1e3, np.degrees(turn))):
             reach[row] = max(reach[row], 1.2 * _span_of(values, time_s, flight.scenario.settling_s))
             for k in range(3):

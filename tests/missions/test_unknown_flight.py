@@ -20,6 +20,7 @@ from chaserdock_protocol.recording.log import read_log
 from source_tree import ROOT
 
 from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.report import report_of
 from chaserdock.analysis.summary import summary_of
 from chaserdock.simulation.mission import SimulatedFlight, simulate
 from chaserdock.summary import Summary
@@ -40,6 +41,13 @@ def messages(flight: SimulatedFlight) -> Iterator[Message]:
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> SimulatedFlight:
     return flown(tmp_path_factory.mktemp("unknown") / "run")
+
+
+@pytest.mark.slow
+def test_the_report_of_a_survey_leaves_out_what_needs_a_reference(flight: SimulatedFlight) -> None:
+    page = report_of(flight.folder)
+    assert "Trajectories" in page
+    assert "no chaser was led relative to the target" in page
 
 
 @pytest.mark.slow(0.1)

@@ -719,7 +719,7 @@ def unknown() -> None:
         for chosen, text, kind in ((mapped, "landmarks", 0), (~mapped, "others", 1)):
             left.plot(*px[chosen].T, ".", markersize=2.5, color=colour(kind), label=text)
         left.set_axis_off()
-        left.legend(loc="lower left", fontsize=7.5)
+        left.legend(loc="lower left", fontsize=7.5, labelcolor="white", frameon=False)
         errors = [(m.sim_time_ns / 1e9, rate_error(m, f.motion[TARGET])) for m in f.maps]
         known = [(t, 100.0 * e) for t, e in errors if e is not None]
         right.semilogy(*zip(*known, strict=True), "o-", markersize=3, color=colour(0))

@@ -702,13 +702,14 @@ def unknown() -> None:
     tracks: FeatureTracks | None = None
     for record in read_log(logs / "unknown-approach" / "run"):
         message = record.message
-        if isinstance(message, Image | FeatureTracks) and message.sim_time_ns == round(at_s * 1e9):
-            if message.chaser == 0 and isinstance(message, Image):
-                image = message
-            elif message.chaser == 0:
-                tracks = message
+        if message.sim_time_ns != round(at_s * 1e9):
+            continue
+        if isinstance(message, Image) and message.chaser == 0:
+            image = message
+        elif isinstance(message, FeatureTracks) and message.chaser == 0:
+            tracks = message
     assert image is not None
-    assert isinstance(tracks, FeatureTracks)
+    assert tracks is not None
     newest = [m for m in f.maps if m.sim_time_ns <= tracks.sim_time_ns][-1]
     mapped = np.isin(tracks.ids, next(t.ids for t in newest.tracks if t.chaser == 0))
     px = np.reshape(tracks.places, (-1, 2)) * PX_STEP

@@ -734,13 +734,14 @@ def unknown() -> None:
     tracks: FeatureTracks | None = None
     for record in read_log(logs / "unknown-approach" / "run"):
         message = record.message
-        at = message.sim_time_ns == round(at_s * 1e9)
-        if at and isinstance(message, Image) and message.chaser == 0:
+        if message.sim_time_ns != round(at_s * 1e9):
+            continue
+        if isinstance(message, Image) and message.chaser == 0:
             image = message
-        elif at and isinstance(message, FeatureTracks) and message.chaser == 0:
+        elif isinstance(message, FeatureTracks) and message.chaser == 0:
             tracks = message
     assert image is not None
-    assert isinstance(tracks, FeatureTracks)
+    assert tracks is not None
     newest = [m for m in f.maps if m.sim_time_ns <= tracks.sim_time_ns][-1]
     mapped = np.isin(tracks.ids, next(t.ids for t in newest.tracks if t.chaser == 0))
     px = np.reshape(tracks.places, (-1, 2)) * PX_STEP
@@ -751,7 +752,7 @@ def unknown() -> None:
         for chosen, text, kind in ((mapped, "landmarks", 0), (~mapped, "others", 1)):
             left.plot(*px[chosen].T, ".", markersize=2.5, color=colour(kind), label=text)
         left.set_axis_off()
-        left.legend(loc="lower left", fontsize=7.5)
+        left.legend(loc="lower left", fontsize=7.5, labelcolor="white", frameon=False)
         errors = [(m.sim_time_ns / 1e9, rate_error(m, f.motion[TARGET])) for m in f.maps]
         known = [(t, 100.0 * e) for t, e in errors if e is not None]
         right.semilogy(*zip(*known, strict=True), "o-", markersize=3, color=colour(0))

@@ -79,6 +79,9 @@ def simulate(
     """Simulate missions in this process, in virtual time, and check invariants. Status 0 only if
     all of them hold.
     """
+    from chaserdock_protocol.process import SINGLE_THREADED
+
+    os.environ |= SINGLE_THREADED  # as the processes of `run`; must precede the import of NumPy
     from chaserdock.simulation.seeds import SeedOptions, UnflownSeed
     from chaserdock.spread import Places
 

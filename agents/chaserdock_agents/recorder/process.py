@@ -158,6 +158,7 @@ class Recorder:
     _received: dict[str, int] = field(default_factory=dict)
     _published: dict[str, dict[str, int]] = field(default_factory=dict)
     _controllers: set[str] = field(default_factory=lambda: {"controller"})
+    _mapper: set[str] = field(default_factory=set)
     _expected: set[str] = field(default_factory=set)
     _latest: dict[str, int] = field(default_factory=dict)
     _acked: int = -1
@@ -224,6 +225,7 @@ class Recorder:
                 if tick.revision or self._controllers != set(tick.controllers):
                     self._commanded = -1  # a controller that is lost may owe the end of a tick
                 self._controllers = set(tick.controllers)
+                self._mapper = {"mapper"} if tick.mapper else set[str]()
                 self._latest[key] = tick.tick
                 self._acknowledge()
             case ActuatorCommand() | SolverStatus():
@@ -285,6 +287,7 @@ class Recorder:
         publishers = {
             "world",
             *self._controllers,
+            *self._mapper,
             *(k.rpartition("/")[0] for k in self._expected if k.startswith("chaser")),
         }
         complete = publishers <= self._published.keys() and not self.missing() and self.idle()

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from .fields import Positive, Section
 
-Seconds = Annotated[float, Field(ge=0.2, le=60, allow_inf_nan=False)]
+WorkSeconds = Annotated[float, Field(ge=0.2, le=60, allow_inf_nan=False)]
 
 
 class MapLimits(Section):
@@ -28,15 +28,15 @@ class MapLimits(Section):
 class Mapping(Section):
     """Work of the mapper with `perception.name = "features"`."""
 
-    first_period_s: Seconds = Field(
+    first_period_s: WorkSeconds = Field(
         default=1.0, description="Interval of attempts at a first map, s, rounded to images."
     )
-    period_s: Seconds = Field(
+    period_s: WorkSeconds = Field(
         default=6.0,
         description="Interval of improvements of a map, s, rounded to images. Each takes 0.5 to "
         "3 s of processor time.",
     )
-    latency_s: Seconds = Field(
+    latency_s: WorkSeconds = Field(
         default=4.0,
         description="Age at which a map begins to count, s: longer than the work on it, so that "
         "in lock-step no tick waits.",

@@ -29,6 +29,7 @@ NATIVE_FOLDERS = (
     "controller/chaserdock_controller/nmpc/native",
     "controller/chaserdock_controller/estimation/joint/native",
     "world/chaserdock_world/physics/native",
+    "chaserdock/envs/native",
 )
 # Sources that every library contains in addition to those of its own folder.
 _SHARED = ("base.h", "elementary.h", "dispatch.c", "build.py")
@@ -175,7 +176,9 @@ def compile_into(out: Path, root: Path, target: BuildTarget) -> dict[Path, str]:
     """
     libraries = {}
     for folder in NATIVE_FOLDERS:
-        place = Path(folder).relative_to(Path(folder).parts[0]) / LIBRARY_NAME
+        # `chaserdock` is a package, the other roots are folders of packages.
+        root_of_packages = "" if folder.startswith("chaserdock/") else Path(folder).parts[0]
+        place = Path(folder).relative_to(root_of_packages) / LIBRARY_NAME
         file = out / place
         file.parent.mkdir(parents=True)
         libraries[compile_kernels(root / folder, target, file)] = place.as_posix()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 from ctypes import byref, c_void_p
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
@@ -72,7 +73,7 @@ class DockingBatch:
         n, m = environments, int(t.chasers)
         self.environments, self.chasers = n, m
         rows = {"bodies": 30, "wrench": 6, "memory": 8, "docked": 7, "errors": 12}
-        a = {name: np.zeros((count, t.pitch)) for name, count in rows.items()}
+        a: dict[str, NDArray[Any]] = {k: np.zeros((count, t.pitch)) for k, count in rows.items()}
         a |= {name: np.zeros((t.actuators, t.pitch), np.int64) for name in ("pulse", "opened")}
         a |= {name: np.zeros(n, np.int64) for name in ("age", "plant", "done", "rejected", "idle")}
         a |= {name: np.zeros((n, m), np.uint8) for name in ("terminated", "truncated")}
@@ -87,7 +88,7 @@ class DockingBatch:
         # The kernel counts in them by body, up to a multiple of four.
         a["rewards"] = np.zeros(t.pitch)
         self._arrays = a
-        self._state = _State(*(location(a[name]) for name, _ in _State._fields_))
+        self._state = _State(*(location(a[field[0]]) for field in _State._fields_))
         self._step, self._start = function("step_batch"), function("start_batch")
 
     def start(self, seed: int | None = None, chosen: Flags | None = None) -> Floats:

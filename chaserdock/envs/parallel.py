@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from chaserdock_protocol.scenario import Scenario
-from gymnasium.spaces import Box
+from gymnasium.spaces import Space
 from pettingzoo import ParallelEnv
 
 from . import loaded
@@ -46,11 +46,11 @@ class DockingParallelEnv(ParallelEnv[str, Floats, Floats]):
         self.action_spaces = {a: action_space(task) for a in self.possible_agents}
         self._started = False
 
-    def observation_space(self, agent: str) -> Box:
+    def observation_space(self, agent: str) -> Space[Floats]:
         """Return the space of an agent's observations."""
         return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> Box:
+    def action_space(self, agent: str) -> Space[Floats]:
         """Return the space of an agent's actions."""
         return self.action_spaces[agent]
 

@@ -78,15 +78,15 @@ class _Window:
 
     def __init__(self) -> None:
         import matplotlib.pyplot as plt
-        from matplotlib import rcsetup
 
-        backend = plt.get_backend()
-        if backend.lower() not in map(str.lower, rcsetup.interactive_bk):
-            raise ChaserdockError(
-                f"render_mode human needs a display; matplotlib has {backend!r} here: use rgb_array"
-            )
         self._plt = plt
         self._figure, self._axes = plt.subplots(num="chaserdock")
+        if self._figure.canvas.required_interactive_framework is None:
+            self.close()
+            raise ChaserdockError(
+                f"render_mode human needs a display; matplotlib has {plt.get_backend()!r} here: "
+                "use rgb_array"
+            )
         self._axes.set_axis_off()
         self._picture = None
 

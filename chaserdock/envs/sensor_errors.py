@@ -89,13 +89,14 @@ def _filters(sigma: Array, density: float, period_s: float) -> Array:
     noise = density**2 * np.array([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]])
     p = np.zeros((*sigma.shape, 2, 2))
     p[..., 0, 0], p[..., 1, 1] = sigma**2, (sigma / t) ** 2
+    square = sigma[..., None, None] ** 2
     for _ in range(_ROUNDS):
-        before = p
-        ahead = move @ p @ move.T + noise
-        gain = ahead[..., :, :1] / (ahead[..., :1, :1] + sigma[..., None, None] ** 2)
-        p = ahead - gain @ ahead[..., :1, :]
+        before, ahead = p, move @ p @ move.T + noise
+        p = ahead - ahead[..., :, :1] @ ahead[..., :1, :] / (ahead[..., :1, :1] + square)
         if np.allclose(p, before, rtol=1e-9, atol=0.0):
             break
+    ahead = move @ p @ move.T + noise
+    gain = ahead[..., :, :1] / (ahead[..., :1, :1] + square)
     keep = (np.eye(2) - gain * np.array([1.0, 0.0])) @ move
     steady = _steady(keep, gain * sigma[..., None, None])
     scale = np.sqrt(p[..., 0, 0] / steady[..., 0, 0])

@@ -3,26 +3,31 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from chaserdock_protocol.errors import ScenarioError
 from chaserdock_protocol.scenario import Scenario
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Space
 
+from .batch import Floats
 from .task import Task
 
 
-def observation_space(task: Task) -> Box:
+def observation_space(task: Task) -> Space[Floats]:
     """Return the space of an observation (width,), not limited; the elements are listed in
     docs/learning.md.
     """
-    return Box(-np.inf, np.inf, (task.width,), np.float32)
+    box: Any = Box(-np.inf, np.inf, (task.width,), np.float32)
+    return box
 
 
-def action_space(task: Task) -> Box:
+def action_space(task: Task) -> Space[Floats]:
     """Return the space of an action (actuators,): shares of the limits of a wrench, -1 to 1, or
     open times of thrusters in shares of a tick, 0 to 1.
     """
-    return Box(0.0 if task.pulsed else -1.0, 1.0, (task.actuators,), np.float32)
+    box: Any = Box(0.0 if task.pulsed else -1.0, 1.0, (task.actuators,), np.float32)
+    return box
 
 
 def require_one_chaser(scenario: Scenario) -> None:

@@ -348,7 +348,7 @@ def _ramp_shares(thruster: ThrusterDynamics, steps: int, hz: int) -> tuple[Array
     """Return the share of the thrust that each step after opening gains over the step before, and
     that each one after closing loses.
     """
-    edges = np.arange(steps + 1) * (1e9 / hz)
+    edges = np.arange(steps + 1, dtype=float) * (1e9 / hz)
     spans, shares = ((0, 10 * steps), (-10 * steps, 0)), []
     for begin, end in spans:
         valve = Valves([thruster])

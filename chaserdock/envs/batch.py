@@ -24,7 +24,7 @@ from .native import LIBRARY, function
 from .task import Task, task_of
 
 Floats = NDArray[np.float32]
-Flags = NDArray[np.bool_]
+Booleans = NDArray[np.bool_]
 
 
 @LIBRARY.structure("Batch")
@@ -42,7 +42,7 @@ class _State(ctypes.Structure):
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class BatchStep:
     """What a step of n environments with m chasers gave.
 
     ``observations`` (n, m, width); ``rewards``, ``terminated``, ``truncated`` and ``outcomes``
@@ -52,8 +52,8 @@ class Step:
 
     observations: Floats
     rewards: Array
-    terminated: Flags
-    truncated: Flags
+    terminated: Booleans
+    truncated: Booleans
     outcomes: IntArray
     rejected: IntArray
 
@@ -91,7 +91,7 @@ class DockingBatch:
         self._state = _State(*(location(a[field[0]]) for field in _State._fields_))
         self._step, self._start = function("step_batch"), function("start_batch")
 
-    def start(self, seed: int | None = None, chosen: Flags | None = None) -> Floats:
+    def start(self, seed: int | None = None, chosen: Booleans | None = None) -> Floats:
         """Start all environments, or those ``chosen`` (n,), and return the observations.
 
         ``seed``: of all random numbers from now on, of every environment; by default they go on.
@@ -107,7 +107,7 @@ class DockingBatch:
         self._start(byref(self.task.numbers), byref(self._state))
         return self._arrays["observations"].copy()
 
-    def step(self, actions: NDArray[np.floating]) -> Step:
+    def step(self, actions: NDArray[np.floating]) -> BatchStep:
         """Fly all environments for a tick with actions (n, m, actuators).
 
         Wrenches in shares of the limits, -1 to 1 along CRF's axes, or open times of the thrusters
@@ -120,7 +120,7 @@ class DockingBatch:
             a["actions"][...] = given
         self._step(byref(self.task.numbers), byref(self._state))
         n, m = self.environments, self.chasers
-        return Step(
+        return BatchStep(
             a["observations"].copy(),
             a["rewards"][: n * m].reshape(n, m).copy(),
             a["terminated"].astype(bool),

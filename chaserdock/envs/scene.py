@@ -17,7 +17,7 @@ from .batch import DockingBatch
 
 RgbImage = NDArray[np.uint8]
 RENDER_MODES = ("human", "rgb_array")
-_WIDTH_PX, _HEIGHT_PX = 640, 480
+_WIDTH_PX, _HEIGHT_PX = 640, 480  # Gymnasium's recorders need even sides
 _AZIMUTH_RAD, _ELEVATION_RAD = math.radians(-60.0), math.radians(25.0)  # beside and above
 _ROOM, _BODY_M = 2.7, 0.6
 """Distance of the viewpoint over that of the farthest body from their middle, and what is added for

@@ -24,7 +24,7 @@ from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.errors import ScenarioError
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.docking import Corridor
-from chaserdock_protocol.scenario.learning import LearningReward, LearningSection
+from chaserdock_protocol.scenario.learning import LearningSection
 from chaserdock_world.actuators.ideal import given_wrench
 from chaserdock_world.actuators.thrusters import true_thrusters
 from chaserdock_world.physics.target_motion import prescribed_state
@@ -84,7 +84,18 @@ class _Place(ctypes.Structure):
 class _Weights(ctypes.Structure):
     """Mirror `Weights` of native/batch.h: the keys of [learning.reward]."""
 
-    _fields_ = _doubles(*LearningReward.model_fields)
+    _fields_ = _doubles(
+        "progress_per_m",
+        "turn_per_rad",
+        "distance_per_m_s",
+        "angle_per_rad_s",
+        "impulse_per_N_s",
+        "corridor_per_s",
+        "within_per_s",
+        "time_per_s",
+        "success",
+        "failure",
+    )
 
 
 @LIBRARY.structure("Task")
@@ -188,7 +199,7 @@ def task_of(scenario: Scenario, environments: int) -> Task:
         docking.final_m,
         _ProbeLimits.of(docking.corridor), _ProbeLimits.of(docking.final),
         _ProbeLimits.of(docking.tolerances),
-        _Weights(*(getattr(learning.reward, name) for name in LearningReward.model_fields)),
+        _Weights(*(getattr(learning.reward, name) for name, _ in _Weights._fields_)),
         _c(start.position_m), math.radians(start.rotation_deg), start.velocity_m_s,
         math.radians(start.rate_deg_s), math.radians(start.target_rate_deg_s),
         _c(_state13(target)), _c(camera.position_crf_m), _c(camera.q_crf_irf_wxyz),

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 MOST_CHASERS = 16
 """Largest number of chasers of an environment: the arrays of its kernel have this size."""
 
-Spread = tuple[NotNegative, NotNegative, NotNegative]
-Angle = Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]
+HalfWidths = tuple[NotNegative, NotNegative, NotNegative]
+HalfTurn = Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]
 
 
 class LearningStart(Section):
@@ -29,8 +29,8 @@ class LearningStart(Section):
     each axis.
     """
 
-    position_m: Spread = Field(default=(0.0, 0.0, 0.0), description="Position (WRF), m.")
-    rotation_deg: Angle = Field(
+    position_m: HalfWidths = Field(default=(0.0, 0.0, 0.0), description="Position (WRF), m.")
+    rotation_deg: HalfTurn = Field(
         default=0.0, description="Attitude: rotation vector (CRF), degrees."
     )
     velocity_m_s: NotNegative = Field(default=0.0, description="Velocity (WRF), m/s.")

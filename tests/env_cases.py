@@ -22,6 +22,15 @@ REWARD = {
     "failure": 30.0,
 }
 
+START = {
+    "position_m": [0.1, 0.2, 0.2],
+    "rotation_deg": 8.0,
+    "velocity_m_s": 0.02,
+    "rate_deg_s": 1.0,
+    "target_rate_deg_s": 1.0,
+}
+"""Spread of the start."""
+
 
 def learning(task: str = "dock", **keys: Any) -> dict[str, Any]:
     """The table [learning]."""
@@ -65,3 +74,21 @@ def along_port(
         "start_rotation_rad": list(rotation_rad),
     }
     return parse_scenario(values | {"learning": learning()} | changes, "test")
+
+
+SEVERAL: dict[str, Any] = ALONG_PORT | {
+    "chasers": [
+        {"position_m": [-1.0, 0.0, -0.05], "q_wxyz": [1.0, 0.0, 0.0, 0.0],
+         "start_offset_m": [0.42, 0.0, 0.0], "start_velocity_m_s": [0.018, 0.0, 0.0]},
+        {"position_m": [1.5, 0.0, 0.0], "q_wxyz": [0.0, 0.0, 0.0, 1.0]},
+        {"position_m": [0.0, 0.0, 2.0], "look_at": "target"},
+    ],
+    "docking": ALONG_PORT["docking"] | {"ports": [
+        {"chaser": 0, "position_m": [-0.2, 0.0, -0.05], "axis": [-1.0, 0.0, 0.0]},
+        {"chaser": 1, "position_m": [0.2, 0.0, 0.0], "axis": [1.0, 0.0, 0.0]},
+        {"chaser": 2, "position_m": [0.0, 0.0, 0.16], "axis": [0.0, 0.0, 1.0]},
+    ]},
+    "target": ALONG_PORT["target"] | {"omega_rad_s": [0.004, 0.0, 0.0]},
+    "learning": learning(),
+}  # fmt: skip
+"""Three chasers with a port each; the first drifts into its own."""

@@ -20,7 +20,7 @@ from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.simulation import TARGET, Physics
-from env_cases import ALONG_PORT, REWARD, along_port, docking, learning
+from env_cases import ALONG_PORT, REWARD, SEVERAL, START, along_port, docking, learning
 
 from chaserdock.envs import batch as batch_module
 from chaserdock.envs import native
@@ -348,14 +348,6 @@ def test_a_target_out_of_view_is_not_measured() -> None:
 
 # -- seeds, rejections, several chasers ------------------------------------------------------------
 
-START = {
-    "position_m": [0.1, 0.2, 0.2],
-    "rotation_deg": 8.0,
-    "velocity_m_s": 0.02,
-    "rate_deg_s": 1.0,
-    "target_rate_deg_s": 1.0,
-}
-
 
 def flown(batch: DockingBatch, seed: int, ticks: int = 120) -> list[Array]:
     """Observations and rewards of the first two environments, with restarts."""
@@ -459,23 +451,6 @@ def test_actions_that_are_not_finite_are_counted_and_flown_as_zero() -> None:
         bad.step(actions[:, 0])
     with pytest.raises(ValueError, match="environments: at least 1"):
         DockingBatch(scenario, 0)
-
-
-SEVERAL = ALONG_PORT | {
-    "chasers": [
-        {"position_m": [-1.0, 0.0, -0.05], "q_wxyz": [1.0, 0.0, 0.0, 0.0],
-         "start_offset_m": [0.42, 0.0, 0.0], "start_velocity_m_s": [0.018, 0.0, 0.0]},
-        {"position_m": [1.5, 0.0, 0.0], "q_wxyz": [0.0, 0.0, 0.0, 1.0]},
-        {"position_m": [0.0, 0.0, 2.0], "look_at": "target"},
-    ],
-    "docking": ALONG_PORT["docking"] | {"ports": [
-        {"chaser": 0, "position_m": [-0.2, 0.0, -0.05], "axis": [-1.0, 0.0, 0.0]},
-        {"chaser": 1, "position_m": [0.2, 0.0, 0.0], "axis": [1.0, 0.0, 0.0]},
-        {"chaser": 2, "position_m": [0.0, 0.0, 0.16], "axis": [0.0, 0.0, 1.0]},
-    ]},
-    "target": ALONG_PORT["target"] | {"omega_rad_s": [0.004, 0.0, 0.0]},
-    "learning": learning(),
-}  # fmt: skip
 
 
 def test_a_docked_chaser_moves_with_the_target_and_a_failure_ends_the_episode_of_all() -> None:

@@ -74,7 +74,7 @@ class DockingBatch:
         self.environments, self.chasers = n, m
         rows = {"bodies": 30, "wrench": 6, "memory": 8, "docked": 7, "errors": 12}
         a: dict[str, NDArray[Any]] = {k: np.zeros((count, t.pitch)) for k, count in rows.items()}
-        a |= {name: np.zeros((t.actuators, t.pitch), np.int64) for name in ("pulse", "opened")}
+        a |= {name: np.zeros((n * m, t.actuators), np.int64) for name in ("pulse", "opened")}
         a |= {name: np.zeros(n, np.int64) for name in ("age", "plant", "done", "rejected", "idle")}
         a |= {name: np.zeros((n, m), np.uint8) for name in ("terminated", "truncated")}
         a["targets"] = np.zeros((30, t.target_pitch))

@@ -22,12 +22,16 @@ BINS = 256
 """Distances of the table. In 256 steps over the distances of `docking-contact` (0.3 to 2.5 m) the
 deviation changes by less than 3 % from one to the next.
 """
-_ROUNDS = 20_000
-"""Most steps of the covariance's recursion. It ends when no element changes by 1e-9 of itself."""
+_DOUBLINGS = 20
+"""Steps of the doubling algorithm: those of a million periods of the filter, which forgets its
+start within a few thousand.
+"""
+_MOVE = np.array([[1.0, 1.0], [0.0, 1.0]])
+"""Prediction of error and rate over a period."""
 
 
 def sensor_table(scenario: Scenario, goal_m: Array, goal_wxyz: Array, distances_m: Array) -> Array:
-    """Return the columns of ``sensor`` (native/batch.h) at distances (n,), (n, 6, 7).
+    """Return the columns of ``sensor`` (native/batch.h) at distances (n,), (n, 6, 9).
 
     ``goal_m`` (3,), ``goal_wxyz`` (4,): place of the chaser in TRF. Raises ScenarioError if no
     marker is seen at any distance.
@@ -46,7 +50,7 @@ def sensor_table(scenario: Scenario, goal_m: Array, goal_wxyz: Array, distances_
     parameters = parameters_of(scenario)
     density = parameters.target_noise[parameters.target.motion_model]
     period_s = 1.0 / scenario.time.image_hz
-    table = np.empty((len(distances_m), 6, 7))
+    table = np.empty((len(distances_m), 6, 9))
     table[:, :, 0] = seen[:, None]
     for first, noise in ((0, density[0]), (3, density[1])):
         axes = slice(first, first + 3)
@@ -78,39 +82,40 @@ def _deviations(scenario: Scenario, goal_m: Array, goal_wxyz: Array, distances_m
 
 
 def _filters(sigma: Array, density: float, period_s: float) -> Array:
-    """Return SIGMA to RATE_ALONE (native/batch.h) for measurements with deviations (n, k), m or
-    rad, and a white acceleration of this density, per s²/√Hz, (n, k, 6).
+    """Return GAIN to RATE_ERROR_ALONE (native/batch.h) for measurements with deviations (n, k), m
+    or rad, and a white acceleration of this density, per s²/√Hz, (n, k, 8).
 
-    The errors are driven by the measurements alone, with a deviation such that the error has the
-    variance that the filter states.
+    In each update the error is multiplied and gets a noise such that its covariance stays the
+    filter's.
     """
-    t = period_s
-    move = np.array([[1.0, t], [0.0, 1.0]])
-    noise = density**2 * np.array([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]])
-    p = np.zeros((*sigma.shape, 2, 2))
-    p[..., 0, 0], p[..., 1, 1] = sigma**2, (sigma / t) ** 2
-    square = sigma[..., None, None] ** 2
-    for _ in range(_ROUNDS):
-        before, ahead = p, move @ p @ move.T + noise
-        p = ahead - ahead[..., :, :1] @ ahead[..., :1, :] / (ahead[..., :1, :1] + square)
-        if np.allclose(p, before, rtol=1e-9, atol=0.0):
-            break
-    ahead = move @ p @ move.T + noise
-    gain = ahead[..., :, :1] / (ahead[..., :1, :1] + square)
-    keep = (np.eye(2) - gain * np.array([1.0, 0.0])) @ move
-    steady = _steady(keep, gain * sigma[..., None, None])
-    scale = np.sqrt(p[..., 0, 0] / steady[..., 0, 0])
-    steady = steady * scale[..., None, None] ** 2
-    error = np.sqrt(steady[..., 0, 0])
-    by_error = steady[..., 0, 1] / error
-    alone = np.sqrt(np.maximum(steady[..., 1, 1] - by_error**2, 0.0))
-    return np.stack(
-        [scale * sigma, gain[..., 0, 0], gain[..., 1, 0], error, by_error, alone], axis=-1
+    # In units of the deviation and the period.
+    noise = (density**2 * period_s**3 / sigma**2)[..., None, None] * np.array(
+        [[1.0 / 3.0, 0.5], [0.5, 1.0]]
     )
+    ahead = _predicted(noise)
+    gain = ahead[..., :, :1] / (ahead[..., :1, :1] + 1.0)
+    steady = ahead - gain @ ahead[..., :1, :]
+    keep = (np.eye(2) - gain * np.array([1.0, 0.0])) @ _MOVE
+    factors = [
+        np.linalg.cholesky(c) for c in (steady - keep @ steady @ np.swapaxes(keep, -1, -2), steady)
+    ]
+    rate = sigma / period_s
+    columns = [gain[..., 0, 0], gain[..., 1, 0] / period_s]
+    for factor in factors:
+        columns += [factor[..., 0, 0] * sigma, factor[..., 1, 0] * rate, factor[..., 1, 1] * rate]
+    return np.stack(columns, axis=-1)
 
 
-def _steady(keep: Array, drive: Array) -> Array:
-    """Return the covariance (..., 2, 2) of x' = keep x + drive n, with white n of unit variance."""
-    product = np.einsum("...ij,...kl->...ikjl", keep, keep).reshape(*keep.shape[:-2], 4, 4)
-    source = (drive @ np.swapaxes(drive, -1, -2)).reshape(*keep.shape[:-2], 4, 1)
-    return np.linalg.solve(np.eye(4) - product, source).reshape(keep.shape)
+def _predicted(noise: Array) -> Array:
+    """Return the steady covariance (..., 2, 2) of the prediction for a process noise (..., 2, 2)
+    and measurements of unit variance: the solution of the Riccati equation, by doubling (E. Chu et
+    al., "A structure-preserving doubling algorithm", 2005).
+    """
+    a, g = np.broadcast_to(_MOVE.T, noise.shape), np.zeros(noise.shape)
+    g[..., 0, 0] = 1.0
+    h = noise
+    for _ in range(_DOUBLINGS):
+        inner = np.linalg.inv(np.eye(2) + g @ h)
+        a_t = np.swapaxes(a, -1, -2)
+        a, g, h = a @ inner @ a, g + a @ inner @ g @ a_t, h + a_t @ h @ inner @ a
+    return h

@@ -384,7 +384,7 @@ def _sensor(scenario: Scenario, places: ctypes.Array[_Place]) -> tuple[Array, Ar
     """
     learning = scenario.learning
     if learning is None or learning.observation == "truth":
-        return np.arange(2.0), np.zeros((2, 6, 7))
+        return np.arange(2.0), np.zeros((2, 6, 9))
     goal = np.array(places[0].goal_m)
     start_m = np.linalg.norm(np.array(places[0].start_m) - scenario.target.position_m)
     near_m, far_m = 0.8 * float(np.linalg.norm(goal)), 2.0 * float(start_m)

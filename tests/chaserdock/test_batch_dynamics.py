@@ -25,6 +25,7 @@ from env_cases import ALONG_PORT, REWARD, SEVERAL, START, along_port, docking, l
 from chaserdock.envs import batch as batch_module
 from chaserdock.envs import native
 from chaserdock.envs.batch import DockingBatch
+from chaserdock.envs.sensor_errors import _filters
 from chaserdock.envs.task import OUTCOMES, SUCCESSES
 
 GENERAL = (
@@ -322,13 +323,32 @@ def test_statistical_observations_have_the_errors_of_the_filter() -> None:
         # The attitude error of the target is half of it in the quaternion, and moves the chaser
         # about it at 1 m: mostly along y and z.
         assert (np.abs(off.mean(axis=0)) < 5.0 * off.std(axis=0) / np.sqrt(2000) + 1e-9).all()
-        np.testing.assert_allclose(2.0 * off[:, 7:10].std(axis=0), row[3:, 4], rtol=0.1)
-        sigma_x = np.hypot(row[0, 4], 0.05 * row[4, 4])
+        np.testing.assert_allclose(2.0 * off[:, 7:10].std(axis=0), row[3:, 6], rtol=0.1)
+        sigma_x = np.hypot(row[0, 6], 0.05 * row[4, 6])
         assert off[:, 0].std() == pytest.approx(sigma_x, rel=0.1)
-        rate = np.hypot(row[3:, 5], row[3:, 6])
+        rate = np.hypot(row[3:, 7], row[3:, 8])
         np.testing.assert_allclose(off[:, 13:16].std(axis=0), rate, rtol=0.1)
     moved = (later - first)[:, 0, :3]
     assert (moved.std(axis=0) > 0.0).all()
+
+
+@pytest.mark.parametrize("sigma", [1e-5, 3e-4, 1e-2])
+def test_the_filter_is_the_kalman_filter(sigma: float) -> None:
+    """Gains and covariance by thousands of steps of its recursion."""
+    t, density = 0.2, 2e-5
+    gain, rate_gain, *_, error, rate_error, alone = _filters(
+        np.array([[sigma]]), density, t
+    ).ravel()
+    move = np.array([[1.0, t], [0.0, 1.0]])
+    noise = density**2 * np.array([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]])
+    p = np.diag([sigma**2, 1e-2])
+    for _ in range(6000):
+        ahead = move @ p @ move.T + noise
+        k = ahead[:, :1] / (ahead[0, 0] + sigma**2)
+        p = ahead - k @ ahead[:1]
+    np.testing.assert_allclose([gain, rate_gain], k[:, 0], rtol=1e-9)
+    found = np.array([[error, 0.0], [rate_error, alone]])
+    np.testing.assert_allclose(found @ found.T, p, rtol=1e-9)
 
 
 def test_a_target_out_of_view_is_not_measured() -> None:

@@ -23,8 +23,8 @@ static void add_changes(const double *shares, int64_t count, double sign, int64_
 static void add_pulses(const Task *t, const Batch *b, int64_t chaser, int64_t from, int64_t to,
                        int64_t at, const double *columns, double *out) {
     for (int64_t j = 0; j < t->actuators; j++) {
-        const int64_t width = b->pulse[j * t->pitch + chaser];
-        const int64_t opened = b->opened[j * t->pitch + chaser];
+        const int64_t width = b->pulse[chaser * t->actuators + j];
+        const int64_t opened = b->opened[chaser * t->actuators + j];
         if (width > 0 && !opened)
             add_changes(t->rise + j * t->steps, t->rise_steps[j], 1.0, 0, from, to, at,
                         columns + 6 * j, out);
@@ -39,7 +39,8 @@ static void add_pulses(const Task *t, const Batch *b, int64_t chaser, int64_t fr
 static double set_pulses(const Task *t, Batch *b, int64_t chaser, const float *levels, int valid) {
     double impulse = 0.0;
     for (int64_t j = 0; j < t->actuators; j++) {
-        int64_t *pulse = b->pulse + j * t->pitch + chaser, *opened = b->opened + j * t->pitch + chaser;
+        int64_t *pulse = b->pulse + chaser * t->actuators + j;
+        int64_t *opened = b->opened + chaser * t->actuators + j;
         *opened = *pulse == t->steps;
         double level = valid ? (double)levels[j] : 0.0;
         level = level > 0.0 ? min_of(level, 1.0) : 0.0;
@@ -47,9 +48,9 @@ static double set_pulses(const Task *t, Batch *b, int64_t chaser, const float *l
         if (width < t->shortest[j]) width = 0;
         if (width > t->longest[j]) width = t->steps;
         *pulse = width;
-        impulse += t->effort_N_s[j] * (double)width / (double)t->steps;
+        impulse += t->effort_N_s[j] * (double)width;
     }
-    return impulse;
+    return impulse / (double)t->steps;
 }
 
 static inline const double *plant_of(const Task *t, const Batch *b, int64_t chaser) {

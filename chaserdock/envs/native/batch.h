@@ -40,9 +40,21 @@ typedef struct {
 LAYOUT(Weights, progress_per_m, turn_per_rad, distance_per_m_s, angle_per_rad_s, impulse_per_N_s,
        corridor_per_s, within_per_s, time_per_s, success, failure)
 
-/* Columns of `sensor`: whether markers are seen, standard deviation of a measurement, gains of the
- * filter for error and its rate, and how an error and its rate (m or rad, per s) are drawn. */
-enum { SEEN, SIGMA, GAIN, RATE_GAIN, ERROR, RATE_BY_ERROR, RATE_ALONE, SENSOR_COLUMNS };
+/* Columns of `sensor`: whether markers are seen; gains of the filter for error and rate; what its
+ * noise adds to them in an update, and how they are drawn at the start: factors of a first random
+ * number for the error and the rate, and of a second one for the rate. In m or rad, and per s. */
+enum {
+    SEEN,
+    GAIN,
+    RATE_GAIN,
+    NOISE,
+    RATE_NOISE,
+    RATE_NOISE_ALONE,
+    ERROR,
+    RATE_ERROR,
+    RATE_ERROR_ALONE,
+    SENSOR_COLUMNS
+};
 
 /* What a step does not change. Spreads of the start are half widths of uniform distributions, per
  * axis. `chaser_plants` (plants, chasers, 17 + 6 actuators) and `target_plants` (plants, 17): rows
@@ -82,13 +94,13 @@ enum { AWAY, TURNED, GAP, LATERAL, LATERAL_SPEED, CLOSING, TURNING, WITHIN, MEMO
 enum { DOCKED_ROWS = 7, ERROR_ROWS = 12, MOTION_ROWS = 13 };
 
 /* The state of all environments. By rows: `bodies` (BODY_ROWS), `targets` (BODY_ROWS), `wrench` (6),
- * `memory`, `docked`, `errors` (6 of the observed pose in CRF, 6 rates), `pulse` and `opened`
- * (actuators): steps of the last pulse, and whether the valve was open before. Per environment:
- * `random`, `age` (ticks), `plant`, `done` (to be reset by the next step). `work`: 24 doubles for
- * each physics step of a tick. Per chaser: `outcome`. Inputs of a step: `actions` (environments,
- * chasers, actuators). Outputs: `observations` (environments, chasers, width), `rewards`,
- * `terminated`, `truncated` (environments, chasers), `rejected` (environments): number of actions of
- * the episode that were not finite. `idle` (environments): whether a step has no action. */
+ * `memory`, `docked`, `errors` (6 of the observed pose in CRF, 6 rates). Per chaser: `outcome`, and
+ * (chasers, actuators) `pulse` and `opened`: steps of the last pulse, and whether the valve was open
+ * before. Per environment: `random`, `age` (ticks), `plant`, `done` (to be reset by the next step),
+ * `idle` (whether a step has no action), `rejected`: number of actions of the episode that were not
+ * finite. `work`: 24 doubles for each physics step of a tick. Inputs of a step: `actions`
+ * (environments, chasers, actuators). Outputs: `observations` (environments, chasers, width),
+ * `rewards`, `terminated`, `truncated` (environments, chasers). */
 typedef struct {
     double *bodies, *targets, *wrench, *memory, *docked, *errors, *work;
     int64_t *pulse, *opened, *age, *plant, *done, *outcome;

@@ -91,25 +91,25 @@ static void draw_errors(const Task *t, Batch *b, int64_t e, int64_t chaser, cons
         const double *row = table + i * SENSOR_COLUMNS;
         b->errors[i * t->pitch + chaser] = row[ERROR] * white[i];
         b->errors[(6 + i) * t->pitch + chaser] =
-            row[RATE_BY_ERROR] * white[i] + row[RATE_ALONE] * white[6 + i];
+            row[RATE_ERROR] * white[i] + row[RATE_ERROR_ALONE] * white[6 + i];
     }
 }
 
 /* Advance the errors of the observed pose by a tick: those of a filter that predicts with a constant
  * rate, and corrects by a measurement where an image shows the target. */
 static void advance_errors(const Task *t, Batch *b, int64_t e, int64_t chaser, const Relative *s) {
-    double table[6 * SENSOR_COLUMNS], white[6];
+    double table[6 * SENSOR_COLUMNS], white[ERROR_ROWS];
     int seen = b->age[e] % t->image_ticks == 0 && in_view(t, s) &&
                sense_at(t, sqrt_of(dot3(s->r, s->r)), table);
-    if (seen) next_normal(b->random + e, white, 6);
+    if (seen) next_normal(b->random + e, white, ERROR_ROWS);
     for (int i = 0; i < 6; i++) {
         double *error = b->errors + i * t->pitch + chaser, *rate = error + 6 * t->pitch;
         *error += t->tick_s * *rate;
         if (!seen) continue;
         const double *row = table + i * SENSOR_COLUMNS;
-        double innovation = row[SIGMA] * white[i] - *error;
-        *error += row[GAIN] * innovation;
-        *rate += row[RATE_GAIN] * innovation;
+        *rate += row[RATE_NOISE] * white[i] + row[RATE_NOISE_ALONE] * white[6 + i] -
+                 row[RATE_GAIN] * *error;
+        *error += row[NOISE] * white[i] - row[GAIN] * *error;
     }
 }
 

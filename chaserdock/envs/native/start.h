@@ -45,7 +45,7 @@ static void start(const Task *t, Batch *b, int64_t e) {
         for (int i = 0; i < 6; i++)
             b->wrench[i * pitch + chaser] = body[DISTURBANCE - MASS + i];
         for (int64_t j = 0; j < t->actuators; j++)
-            b->pulse[j * pitch + chaser] = b->opened[j * pitch + chaser] = 0;
+            b->pulse[chaser * t->actuators + j] = b->opened[chaser * t->actuators + j] = 0;
     }
     read_motion(b->targets + e, t->target_pitch, &target);
     Relative states[MAX_CHASERS];

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import warnings
@@ -17,6 +18,7 @@ from chaserdock_protocol.scenario import Scenario, parse_scenario
 from env_cases import ALONG_PORT, SEVERAL, START, along_port, docking
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
+from harness import ROOT
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from chaserdock import envs
@@ -257,3 +259,29 @@ def test_without_the_extra_its_name_is_said(package: str, call: tuple[str, ...])
     (line,) = done.stdout.splitlines()
     assert f"{package}, of the extra chaserdock[learn], is not installed" in line
     assert "pip install -e '.[learn]'" in line
+
+
+# -- examples --------------------------------------------------------------------------------------
+
+EXAMPLES = ROOT / "examples" / "learning"
+
+
+@pytest.mark.slow
+def test_the_proportional_law_of_the_example_docks() -> None:
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / "proportional.py"), "200"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    counts = {word: int(n) for word, n in re.findall(r"^(\w[\w ]*?) +(\d+)$", done.stdout, re.M)}
+    assert sum(counts.values()) == 200
+    assert counts["docked"] >= 196
+
+
+@pytest.mark.parametrize("name", ["docking", "holding"])
+def test_tasks_of_the_examples_have_rewards(name: str) -> None:
+    environment = envs.make(EXAMPLES / f"{name}.toml")
+    environment.reset(seed=1)
+    rewards = [environment.step(environment.action_space.sample())[1] for _ in range(3)]
+    assert len({*rewards, 0.0}) == 4

@@ -170,18 +170,23 @@ def compile_all(root: Path) -> list[Path]:
     return [compile_kernels(root / folder) for folder in NATIVE_FOLDERS]
 
 
+def place_of(folder: str) -> str:
+    """Return the place among the packages of the library in a folder of ``NATIVE_FOLDERS``."""
+    first, _, rest = folder.partition("/")
+    # `chaserdock` is a package, the other roots are folders of packages.
+    return f"{folder if first == 'chaserdock' else rest}/{LIBRARY_NAME}"
+
+
 def compile_into(out: Path, root: Path, target: BuildTarget) -> dict[Path, str]:
     """Compile all libraries for ``target`` into ``out``; return each one's file, with its place
     among the packages.
     """
     libraries = {}
     for folder in NATIVE_FOLDERS:
-        # `chaserdock` is a package, the other roots are folders of packages.
-        root_of_packages = "" if folder.startswith("chaserdock/") else Path(folder).parts[0]
-        place = Path(folder).relative_to(root_of_packages) / LIBRARY_NAME
+        place = place_of(folder)
         file = out / place
         file.parent.mkdir(parents=True)
-        libraries[compile_kernels(root / folder, target, file)] = place.as_posix()
+        libraries[compile_kernels(root / folder, target, file)] = place
     return libraries
 
 

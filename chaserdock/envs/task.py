@@ -199,7 +199,7 @@ def task_of(scenario: Scenario, environments: int) -> Task:
         docking.final_m,
         _ProbeLimits.of(docking.corridor), _ProbeLimits.of(docking.final),
         _ProbeLimits.of(docking.tolerances),
-        _Weights(*(getattr(learning.reward, name) for name, _ in _Weights._fields_)),
+        _Weights(*(getattr(learning.reward, field[0]) for field in _Weights._fields_)),
         _c(start.position_m), math.radians(start.rotation_deg), start.velocity_m_s,
         math.radians(start.rate_deg_s), math.radians(start.target_rate_deg_s),
         _c(_state13(target)), _c(camera.position_crf_m), _c(camera.q_crf_irf_wxyz),

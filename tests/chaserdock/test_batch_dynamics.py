@@ -21,6 +21,7 @@ from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.simulation import TARGET, Physics
 from env_cases import ALONG_PORT, REWARD, SEVERAL, START, along_port, docking, learning
+from numpy.typing import NDArray
 
 from chaserdock.envs import batch as batch_module
 from chaserdock.envs import native
@@ -159,7 +160,7 @@ def test_a_drift_to_the_port_ends_as_in_the_world(name: str) -> None:
     batch.start(0)
     physics.command_latch(0, "arm", 0)
     steps, latch = scenario.timing.steps_per_tick, physics.latches["chaser/0"]
-    outcome, touched_tick = 0, None
+    outcome, ended_tick, touched_tick = 0, 0, None
     for tick in range(1, 200):
         if not outcome:
             outcome = int(batch.step(np.zeros((1, 1, 6))).outcomes[0, 0])
@@ -224,6 +225,8 @@ def place(batch: DockingBatch, state: BodyState) -> None:
     parts = [state.position_m, state.velocity_m_s, state.q_wxyz, state.omega_rad_s]
     rows[:13, 0] = np.concatenate(parts)
 
+
+HERE = (0.0, 0.0, 0.0)
 
 # -- reward and observation ------------------------------------------------------------------------
 
@@ -305,17 +308,16 @@ def test_statistical_observations_have_the_errors_of_the_filter() -> None:
     the table.
     """
     keys = {"observation": "statistical", "episode_s": 60.0}
-    still = {"chasers": [{**ALONG_PORT["chasers"][0]}]}
-    camera = {"camera": {"width_px": 960, "height_px": 540}}
-    scenario = along_port((0, 0, 0), (0, 0, 0), learning=learning(**keys), **camera)
-    exact = along_port((0, 0, 0), (0, 0, 0), learning=learning(episode_s=60.0), **camera)
-    assert still["chasers"][0]["position_m"] == [-1.0, 0.0, -0.05]
+    camera = {"width_px": 960, "height_px": 540}
+    scenario = along_port(HERE, HERE, learning=learning(**keys), camera=camera)
+    exact = along_port(HERE, HERE, learning=learning(episode_s=60.0), camera=camera)
     noisy, true = DockingBatch(scenario, 2000), DockingBatch(exact, 1)
     first, truth = noisy.start(4), true.start(4)
     table: Any = noisy.task.kept[7]
     numbers = noisy.task.numbers
     at = (np.linalg.norm([-1.0, 0.0, -0.05]) - numbers.bin_first_m) / numbers.bin_m
     row = table[round(float(at))]
+    later = first
     for _ in range(150):
         later = noisy.step(np.zeros((2000, 1, 6))).observations
     for seen in (first, later):
@@ -341,7 +343,7 @@ def test_the_filter_is_the_kalman_filter(sigma: float) -> None:
     ).ravel()
     move = np.array([[1.0, t], [0.0, 1.0]])
     noise = density**2 * np.array([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]])
-    p = np.diag([sigma**2, 1e-2])
+    p, k = np.diag([sigma**2, 1e-2]), np.zeros((2, 1))
     for _ in range(6000):
         ahead = move @ p @ move.T + noise
         k = ahead[:, :1] / (ahead[0, 0] + sigma**2)
@@ -353,7 +355,7 @@ def test_the_filter_is_the_kalman_filter(sigma: float) -> None:
 
 def test_a_target_out_of_view_is_not_measured() -> None:
     keys = learning(observation="statistical", episode_s=60.0)
-    scenario = along_port((0, 0, 0), (0, 0, 0), learning=keys)
+    scenario = along_port(HERE, HERE, learning=keys)
     batch = DockingBatch(scenario, 2)
     batch.start(0)
     away = dataclasses.replace(batch.state(0, 0), q_wxyz=np.array([0.0, 0.0, 0.0, 1.0]))
@@ -369,9 +371,10 @@ def test_a_target_out_of_view_is_not_measured() -> None:
 # -- seeds, rejections, several chasers ------------------------------------------------------------
 
 
-def flown(batch: DockingBatch, seed: int, ticks: int = 120) -> list[Array]:
+def flown(batch: DockingBatch, seed: int, ticks: int = 120) -> list[NDArray[Any]]:
     """Observations and rewards of the first two environments, with restarts."""
-    rng, out = np.random.default_rng(7), [batch.start(seed)[:2]]
+    rng, out = np.random.default_rng(7), list[NDArray[Any]]()
+    out.append(batch.start(seed)[:2])
     for _ in range(ticks):
         actions = np.zeros((batch.environments, batch.chasers, batch.task.actuators))
         actions[:2] = rng.uniform(-1.0, 1.0, actions[:2].shape)
@@ -453,7 +456,8 @@ def test_bodies_are_drawn_from_the_truth() -> None:
 def test_actions_that_are_not_finite_are_counted_and_flown_as_zero() -> None:
     scenario = docking('chaser.actuation="ideal"', episode_s=2.0)
     bad, still = DockingBatch(scenario, 3), DockingBatch(scenario, 3)
-    bad.start(1), still.start(1)
+    bad.start(1)
+    still.start(1)
     actions = np.zeros((3, 1, 6))
     actions[0] = 0.5
     refused = actions.copy()
@@ -463,8 +467,9 @@ def test_actions_that_are_not_finite_are_counted_and_flown_as_zero() -> None:
         np.testing.assert_array_equal(ours.observations, theirs.observations)
         assert ours.rejected.tolist() == [0, tick + 1, tick + 1]
         assert theirs.rejected.tolist() == [0, 0, 0]
-    for _ in range(21):
-        ours = bad.step(refused)
+    for _ in range(20):
+        bad.step(refused)
+    ours = bad.step(refused)
     assert ours.outcomes[:, 0].tolist() == [0, 0, 0]  # started anew, with the count
     assert ours.rejected.tolist() == [0, 0, 0]
     with pytest.raises(ValueError, match=r"^actions: the shape is \(3, 6\), not \(3, 1, 6\)$"):
@@ -478,10 +483,9 @@ def test_a_docked_chaser_moves_with_the_target_and_a_failure_ends_the_episode_of
     batch = DockingBatch(scenario, 1)
     batch.start(0)
     zeros = np.zeros((1, 3, 6))
-    for _ in range(60):
+    done = batch.step(zeros)
+    while not done.terminated.any():
         done = batch.step(zeros)
-        if done.terminated.any():
-            break
     assert done.terminated[0].tolist() == [True, False, False]
     places = []
     for _ in range(20):

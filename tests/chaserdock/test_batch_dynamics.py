@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chaserdock_controller.guidance.approach_cone import cone_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState
@@ -23,12 +24,14 @@ from chaserdock_world.physics.simulation import TARGET, Physics
 from env_cases import ALONG_PORT, REWARD, SEVERAL, START, along_port, docking, learning
 from numpy.typing import NDArray
 
+from chaserdock.analysis.criteria import nearest_allowed_m
 from chaserdock.envs import batch as batch_module
 from chaserdock.envs import native
 from chaserdock.envs.batch import DockingBatch
 from chaserdock.envs.sensor_errors import _filters
 from chaserdock.envs.task import OUTCOMES, SUCCESSES
 
+HERE = (0.0, 0.0, 0.0)
 GENERAL = (
     "seed=5",
     "time.physics_hz=1000",  # whole nanoseconds, to which messages round times
@@ -219,14 +222,56 @@ def test_a_panel_beside_the_way_is_hit() -> None:
     assert OUTCOMES[int(done.outcomes[0, 0])] == "collision"
 
 
+def test_the_keep_out_is_that_of_criteria_and_corridor() -> None:
+    """At random places around the target, without contact: nearer than missions allow, or outside
+    of the guidance's cone within the keep-out distance.
+    """
+    scenario = along_port(HERE, HERE, limits={"min_distance_target_m": 0.8})
+    cone, nearest_m = cone_of(scenario, 0), nearest_allowed_m(scenario, 0)
+    rng, found = np.random.default_rng(4), []
+    for _ in range(300):
+        batch = DockingBatch(scenario, 1)
+        batch.start(0)
+        state = batch.state(0, 0)
+        offset = rng.normal(size=3) + np.array([-1.0, 0.0, 0.0])
+        offset *= rng.uniform(0.45, 0.9) / np.linalg.norm(offset)
+        outward = rotations.multiply([0.0, 0.0, 0.0, 1.0], state.q_wxyz)  # the probe points away
+        place(batch, dataclasses.replace(state, position_m=offset, q_wxyz=outward))
+        word = OUTCOMES[int(batch.step(np.zeros((1, 1, 6))).outcomes[0, 0])]
+        if word == "collision":
+            continue
+        away_m = float(np.linalg.norm(offset))
+        near = away_m < nearest_m or (away_m < 0.8 and cone.room_m(offset) < 0.0)
+        assert (word == "too near") == near
+        found.append((near, away_m < 0.8))
+    assert {(False, False), (False, True), (True, True)} == set(found)
+
+
+def test_leaving_the_corridor_before_the_port_costs_its_weight() -> None:
+    weights = {"corridor_per_s": 3.0}
+    scenario = along_port((0.2, 0.0, 0.0), HERE, learning=learning(reward=weights))
+    for lateral_m, gap_m, outside in (
+        (0.029, 0.2, False),
+        (0.031, 0.2, True),  # docking.corridor
+        (0.031, 0.4, False),  # before its entry
+        (0.009, 0.05, True),  # docking.final
+        (0.007, 0.05, False),
+    ):
+        batch = DockingBatch(scenario, 1)
+        batch.start(0)
+        off = [-0.55 - gap_m, 0.6 * lateral_m, -0.05 + 0.8 * lateral_m]
+        place(batch, dataclasses.replace(batch.state(0, 0), position_m=np.array(off)))
+        done = batch.step(np.zeros((1, 1, 6)))
+        assert done.outcomes[0, 0] == 0
+        assert done.rewards[0, 0] == pytest.approx(-3.0 / 15.0 if outside else 0.0)
+
+
 def place(batch: DockingBatch, state: BodyState) -> None:
     """Set the motion of the only chaser, whose frame is its principal one."""
     rows = batch._arrays["bodies"]
     parts = [state.position_m, state.velocity_m_s, state.q_wxyz, state.omega_rad_s]
     rows[:13, 0] = np.concatenate(parts)
 
-
-HERE = (0.0, 0.0, 0.0)
 
 # -- reward and observation ------------------------------------------------------------------------
 

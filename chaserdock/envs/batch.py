@@ -21,7 +21,7 @@ from chaserdock_world.plant import PrincipalFrame
 from numpy.typing import NDArray
 
 from .native import LIBRARY, function
-from .task import Task, task_of
+from .task import TrainingTask, task_of
 
 Floats = NDArray[np.float32]
 Booleans = NDArray[np.bool_]
@@ -68,7 +68,7 @@ class DockingBatch:
     def __init__(self, scenario: Scenario, environments: int) -> None:
         if environments < 1:
             raise ValueError(f"environments: at least 1 (got {environments})")
-        self.task: Task = task_of(scenario, environments)
+        self.task: TrainingTask = task_of(scenario, environments)
         t = self.task.numbers
         n, m = environments, int(t.chasers)
         self.environments, self.chasers = n, m

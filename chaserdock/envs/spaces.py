@@ -11,10 +11,10 @@ from chaserdock_protocol.scenario import Scenario
 from gymnasium.spaces import Box, Space
 
 from .batch import Floats
-from .task import Task
+from .task import TrainingTask
 
 
-def observation_space(task: Task) -> Space[Floats]:
+def observation_space(task: TrainingTask) -> Space[Floats]:
     """Return the space of an observation (width,), not limited; the elements are listed in
     docs/learning.md.
     """
@@ -22,7 +22,7 @@ def observation_space(task: Task) -> Space[Floats]:
     return box
 
 
-def action_space(task: Task) -> Space[Floats]:
+def action_space(task: TrainingTask) -> Space[Floats]:
     """Return the space of an action (actuators,): shares of the limits of a wrench, -1 to 1, or
     open times of thrusters in shares of a tick, 0 to 1.
     """

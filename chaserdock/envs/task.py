@@ -133,7 +133,7 @@ class TaskNumbers(ctypes.Structure):
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class TrainingTask:
     """A scenario's training task. ``numbers`` points into ``kept``."""
 
     scenario: Scenario
@@ -157,7 +157,7 @@ class Task:
         return self.numbers.width
 
 
-def task_of(scenario: Scenario, environments: int) -> Task:
+def task_of(scenario: Scenario, environments: int) -> TrainingTask:
     """Return the task of a number of environments.
 
     Raises ScenarioError for a scenario without ``[learning]``, or with parts that the environments
@@ -205,7 +205,7 @@ def task_of(scenario: Scenario, environments: int) -> Task:
         _c(_state13(target)), _c(camera.position_crf_m), _c(camera.q_crf_irf_wxyz),
         _c([left, top, right, bottom]), distances_m[0], distances_m[1] - distances_m[0], *pointers,
     )  # fmt: skip
-    return Task(scenario, learning, numbers, (places, *arrays))
+    return TrainingTask(scenario, learning, numbers, (places, *arrays))
 
 
 def _padded(count: int) -> int:

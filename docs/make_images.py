@@ -38,6 +38,7 @@ from chaserdock.analysis.mapping import rate_error
 from chaserdock.analysis.plots import FAINT, GRID, INK, LIMIT, SERIES, colour, styled
 from chaserdock.analysis.pose_errors import pose_error
 from chaserdock.analysis.summary import tracking_errors
+from chaserdock.envs import make
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
@@ -936,6 +937,18 @@ def dataset() -> None:
     write("dataset", np.vstack(rows))
 
 
+def learning() -> None:
+    """Starts of a training environment, as it renders itself."""
+    tiles = []
+    for seed in (1, 3, 5):
+        environment = make(ROOT / "examples" / "learning" / "docking.toml", render_mode="rgb_array")
+        environment.reset(seed=seed)
+        picture = environment.render()
+        assert picture is not None
+        tiles.append(picture[80:400, 100:540, ::-1])
+    write("learning", np.hstack(tiles))
+
+
 def write(name: str, image: np.ndarray) -> None:
     """Write grey levels, or colours (BGR), as docs/images/NAME.webp."""
     cv2.imwrite(str(IMAGES / f"{name}.webp"), image, [cv2.IMWRITE_WEBP_QUALITY, 80])
@@ -1029,7 +1042,7 @@ PICTURES: dict[str, Callable[[], None]] = {
     "unknown-target": unknown,
     "results": results, "reproduction-curves": reproduction, "thrusters": thrusters,
     "targets": targets, "track": tracked, "dataset": dataset, "report": report,
-    "campaign": campaign,
+    "campaign": campaign, "learning": learning,
     "terminal": first_flight, "status": log_info,
 }  # fmt: skip
 

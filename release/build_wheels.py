@@ -34,6 +34,7 @@ KERNELS = {
     "chaserdock_controller/nmpc/native/kernels.so",
     "chaserdock_controller/estimation/joint/native/kernels.so",
     "chaserdock_world/physics/native/kernels.so",
+    "chaserdock/envs/native/kernels.so",
 }
 # Files that a mission needs beside modules.
 DATA = (

@@ -19,9 +19,11 @@ from chaserdock_world.rendering import native as rendering
 from sanitizers import kernels_in
 from source_tree import ROOT
 
+from chaserdock.envs import native as envs
+
 _LIBRARIES = {
     str(one.LIBRARY.path.parent.relative_to(ROOT)): one.LIBRARY
-    for one in (models, perception, rendering, nmpc, joint, physics)
+    for one in (models, perception, rendering, nmpc, joint, physics, envs)
 }
 
 for number, folder in enumerate(NATIVE_FOLDERS):

@@ -47,6 +47,7 @@ _TESTS = (
     "tests/agents/test_perception.py",
     "tests/agents/test_small_markers.py::test_one_far_marker_always_lists_its_true_pose",
     "tests/agents/test_views.py",
+    "tests/chaserdock/test_batch_dynamics.py",
     "tests/controller/test_dynamics.py",
     "tests/controller/test_identification.py::test_the_transition_is_the_derivative_of_the_prediction",
     "tests/controller/test_joint.py",

@@ -120,7 +120,7 @@ def test_the_walk_reaches_nested_fields_and_finds_truth() -> None:
 def test_every_field_that_is_not_shared_is_known_to_be_truth_or_bookkeeping() -> None:
     """A new key of the full scenario is hidden unless it is declared in the flight scenario."""
     only_full = set(Scenario.model_fields) - set(FlightScenario.model_fields)
-    assert only_full - {"extends", "steady_until_s", "world"} <= FORBIDDEN_ANYWHERE
+    assert only_full - {"extends", "steady_until_s", "world", "learning"} <= FORBIDDEN_ANYWHERE
 
 
 # -- values ----------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from chaserdock_models.native.build import NATIVE_FOLDERS, TARGETS
+from chaserdock_models.native.build import NATIVE_FOLDERS, TARGETS, place_of
 from source_tree import ROOT
 
 
@@ -42,9 +42,7 @@ def test_the_lock_file_has_the_version_of_pyproject() -> None:
 
 def test_every_target_is_built_and_every_kernel_expected() -> None:
     assert set(release.TARGETS) == set(TARGETS)
-    assert {
-        f"{folder.partition('/')[2]}/kernels.so" for folder in NATIVE_FOLDERS
-    } == release.KERNELS
+    assert {place_of(folder) for folder in NATIVE_FOLDERS} == release.KERNELS
 
 
 def macho(

@@ -332,7 +332,7 @@ def test_every_page_starts_with_something_to_do() -> None:
         )
 
 
-@pytest.mark.parametrize("page", ["frames.md", "flight_scenario.md"])
+@pytest.mark.parametrize("page", ["frames.md", "flight_scenario.md", "learning.md"])
 def test_first_program_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[str]) -> None:
     exec(next(block for name, block in fences("python") if name == page), {})
     assert capsys.readouterr().out

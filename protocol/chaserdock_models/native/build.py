@@ -29,6 +29,7 @@ NATIVE_FOLDERS = (
     "controller/chaserdock_controller/nmpc/native",
     "controller/chaserdock_controller/estimation/joint/native",
     "world/chaserdock_world/physics/native",
+    "chaserdock/envs/native",
 )
 # Sources that every library contains in addition to those of its own folder.
 _SHARED = ("base.h", "elementary.h", "dispatch.c", "build.py")
@@ -169,16 +170,23 @@ def compile_all(root: Path) -> list[Path]:
     return [compile_kernels(root / folder) for folder in NATIVE_FOLDERS]
 
 
+def place_of(folder: str) -> str:
+    """Return the place among the packages of the library in a folder of ``NATIVE_FOLDERS``."""
+    first, _, rest = folder.partition("/")
+    # `chaserdock` is a package, the other roots are folders of packages.
+    return f"{folder if first == 'chaserdock' else rest}/{LIBRARY_NAME}"
+
+
 def compile_into(out: Path, root: Path, target: BuildTarget) -> dict[Path, str]:
     """Compile all libraries for ``target`` into ``out``; return each one's file, with its place
     among the packages.
     """
     libraries = {}
     for folder in NATIVE_FOLDERS:
-        place = Path(folder).relative_to(Path(folder).parts[0]) / LIBRARY_NAME
+        place = place_of(folder)
         file = out / place
         file.parent.mkdir(parents=True)
-        libraries[compile_kernels(root / folder, target, file)] = place.as_posix()
+        libraries[compile_kernels(root / folder, target, file)] = place
     return libraries
 
 

@@ -17,6 +17,7 @@ from .faults import Fault
 from .fields import MAX_CHASERS, Index, NotNegative, Positive, Section, Vector
 from .flight import FlightScenario
 from .lab import LabSection, check_lab
+from .learning import LearningSection, check_learning
 from .mapping import MapLimits
 from .rendezvous import Arrival, ConeLimit, SpeedLimit
 from .schema import FlightChaser
@@ -139,6 +140,7 @@ class Scenario(FlightScenario):
     truth: TruthSection = TruthSection()
     simulation: SimulationSection = SimulationSection()
     lab: LabSection | None = None
+    learning: LearningSection | None = None
 
     @model_validator(mode="after")
     def _check_consistent(self) -> Scenario:
@@ -146,6 +148,7 @@ class Scenario(FlightScenario):
             raise ValueError("extends: is resolved in scenario files only")
         check_consistent(self)
         check_lab(self)
+        check_learning(self)
         return self
 
     def goal_of(self, chaser: int) -> tuple[float, Vector] | None:

@@ -107,7 +107,7 @@ class IdealActuators:
         self._received += 1
         wrench = limited(wrench, limit)
         if self.errors is not None:
-            wrench = _given(self.errors, wrench, effective_step)
+            wrench = given_wrench(self.errors, wrench, effective_step)
             delayed = effective_step + round(self.errors.delay(effective_step) * self.physics_hz)
             # Jitter does not change the order of commands.
             effective_step = self._last_step = max(delayed, now_step, self._last_step)
@@ -155,7 +155,7 @@ class IdealActuators:
         return output
 
 
-def _given(errors: ActuationErrors, wrench: Array, step: int) -> Array:
+def given_wrench(errors: ActuationErrors, wrench: Array, step: int) -> Array:
     """Return the wrench (6,) that actuators with errors give for a command that acts from ``step``
     on.
     """

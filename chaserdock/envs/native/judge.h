@@ -1,0 +1,137 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* The end of a tick: events, rewards, observations. */
+#ifndef CHASERDOCK_JUDGE_H
+#define CHASERDOCK_JUDGE_H
+
+#include "observe.h"
+#include "probe.h"
+
+/* Fix a chaser that docks to its target, where it is. */
+static void fix_to_target(const Task *t, Batch *b, int64_t chaser, const Motion *target) {
+    double y[MOTION_ROWS], apart[3], place[3], back[4], q[4];
+    for (int i = 0; i < MOTION_ROWS; i++) y[i] = b->bodies[i * t->pitch + chaser];
+    subtract3(y, target->x, apart);
+    q_rotate_inverse(target->q, apart, place);
+    q_conjugate(target->q, back);
+    q_multiply(back, y + ATTITUDE, q);
+    for (int i = 0; i < 3; i++) b->docked[i * t->pitch + chaser] = place[i];
+    for (int i = 0; i < 4; i++) b->docked[(3 + i) * t->pitch + chaser] = q[i];
+}
+
+/* Move a docked chaser with its target. */
+static void carry(const Task *t, Batch *b, int64_t chaser, const Motion *target) {
+    double fixed[DOCKED_ROWS], place[3], turning[3], q[4], w[3];
+    for (int i = 0; i < DOCKED_ROWS; i++) fixed[i] = b->docked[i * t->pitch + chaser];
+    q_rotate(target->q, fixed, place);
+    cross3(target->w, fixed, turning);
+    q_rotate(target->q, turning, turning);
+    q_multiply(target->q, fixed + 3, q);
+    q_rotate_inverse(fixed + 3, target->w, w);
+    double *rows = b->bodies + chaser;
+    for (int i = 0; i < 3; i++) {
+        rows[(POSITION + i) * t->pitch] = target->x[i] + place[i];
+        rows[(VELOCITY + i) * t->pitch] = target->v[i] + turning[i];
+        rows[(RATE + i) * t->pitch] = w[i];
+    }
+    for (int i = 0; i < 4; i++) rows[(ATTITUDE + i) * t->pitch] = q[i];
+}
+
+/* Whether a chaser is nearer to the target than allowed: nearer than the criterion of missions, or
+ * nearer than the keep-out distance outside of its cone. */
+static int too_near(const Task *t, const Place *place, const Relative *s) {
+    double square = dot3(s->r, s->r), near = place->nearest_m, keep = t->keep_target_m;
+    if (square < near * near) return 1;
+    if (!(square < keep * keep)) return 0;
+    double along = dot3(s->r, place->cone_axis), aside[3];
+    for (int i = 0; i < 3; i++) aside[i] = s->r[i] - along * place->cone_axis[i];
+    double room = place->cone_sine * (along - place->cone_apex_m) -
+                  place->cone_cosine * sqrt_of(dot3(aside, aside));
+    return !(room >= 0.0);
+}
+
+/* Return the event of a chaser in this tick. ``before``, ``now``: at its ends. */
+static int event_of(const Task *t, const Place *place, const Relative *s, const ProbeState *before,
+                    const ProbeState *now, double within_ticks) {
+    if (!(dot3(s->r, s->r) <= t->farthest_m * t->farthest_m) || !(now->turning <= t->fastest_rad_s))
+        return LOST;
+    if (t->task == LATCH && before->gap > 0.0 && now->gap <= 0.0) {
+        ProbeState contact;
+        between(before, now, before->gap / (before->gap - now->gap), &contact);
+        if (contact.lateral <= t->contact.lateral_m)
+            return within(&contact, &t->contact) ? DOCKED : COLLIDED;
+    }
+    if (collides(t, s)) return COLLIDED;
+    if (too_near(t, place, s)) return TOO_NEAR;
+    if (t->task == COME && within_ticks >= (double)t->held_ticks) return DOCKED;
+    return FLYING;
+}
+
+/* Judge an environment after a tick: outcome, reward and observation of each chaser. `rewards` holds
+ * the impulse of each. */
+static void judge(const Task *t, Batch *b, int64_t e) {
+    const int64_t first = e * t->chasers, pitch = t->pitch, count = t->chasers;
+    const Weights *w = &t->weights;
+    Motion target;
+    Relative states[MAX_CHASERS];
+    double others[3 * MAX_CHASERS];
+    int failed = 0, flying = 0;
+    read_motion(b->targets + e, t->target_pitch, &target);
+    b->age[e]++;
+    for (int64_t i = 0; i < count; i++) {
+        Motion m;
+        if (b->outcome[first + i] == DOCKED) carry(t, b, first + i, &target);
+        read_motion(b->bodies + first + i, pitch, &m);
+        relative_motion(&m, &target, states + i);
+        copy(states[i].r, others + 3 * i, 3);
+    }
+    for (int64_t i = 0; i < count; i++) {
+        const int64_t chaser = first + i;
+        double *reward = b->rewards + chaser;
+        const double impulse = *reward;
+        b->terminated[chaser] = b->truncated[chaser] = 0;
+        *reward = 0.0;
+        if (b->outcome[chaser] == DOCKED) continue;
+        ProbeState before, now;
+        recall(t, b, chaser, &before);
+        probe_state(t, t->places + i, states + i, &now);
+        remember(t, b, chaser, &now);
+        double *ticks = b->memory + WITHIN * pitch + chaser;
+        const int good = now.away <= t->held_m && now.turned <= t->held_rad;
+        *ticks = good ? *ticks + 1.0 : 0.0;
+        int event = event_of(t, t->places + i, states + i, &before, &now, *ticks);
+        for (int64_t k = 0; k < count && event == FLYING; k++) {
+            double apart[3];
+            subtract3(states[i].r, states[k].r, apart);
+            if (k != i && dot3(apart, apart) < t->keep_chasers_m * t->keep_chasers_m)
+                event = TOO_NEAR;
+        }
+        if (event == FLYING && b->age[e] >= t->episode_ticks)
+            event = t->task == HOLD && *ticks >= (double)t->held_ticks ? HELD : TIME_OUT;
+        const ProbeLimits *limits = now.gap < t->final_m ? &t->final : &t->corridor;
+        const int outside = t->task == LATCH && now.gap < t->entry_m && !within(&now, limits);
+        *reward = w->progress_per_m * (before.away - now.away) +
+                  w->turn_per_rad * (before.turned - now.turned) - w->impulse_per_N_s * impulse -
+                  t->tick_s * (w->distance_per_m_s * now.away + w->angle_per_rad_s * now.turned +
+                               w->time_per_s + (outside ? w->corridor_per_s : 0.0) -
+                               (good ? w->within_per_s : 0.0));
+        if (event == DOCKED || event == HELD) *reward += w->success;
+        b->outcome[chaser] = event;
+        if (event == DOCKED) fix_to_target(t, b, chaser, &target);
+        b->terminated[chaser] = event == DOCKED || event == COLLIDED || event == TOO_NEAR ||
+                                event == LOST;
+        b->truncated[chaser] = event == HELD || event == TIME_OUT;
+        failed |= event == COLLIDED || event == TOO_NEAR || event == LOST;
+        flying |= event == FLYING;
+        if (t->statistical) advance_errors(t, b, e, chaser, states + i);
+        observe(t, b, chaser, i, states + i, &target, others);
+    }
+    for (int64_t chaser = first; failed && chaser < first + count; chaser++) {
+        const int64_t outcome = b->outcome[chaser];
+        if (outcome == DOCKED) continue;
+        b->rewards[chaser] -= w->failure;
+        if (outcome == FLYING) b->outcome[chaser] = AFTER_OTHERS, b->terminated[chaser] = 1;
+    }
+    b->done[e] = failed || !flying;
+}
+
+#endif

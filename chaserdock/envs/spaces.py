@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gymnasium's spaces of a training task."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from chaserdock_protocol.errors import ScenarioError
+from chaserdock_protocol.scenario import Scenario
+from gymnasium.spaces import Box, Space
+
+from .batch import Floats
+from .task import TrainingTask
+
+
+def observation_space(task: TrainingTask) -> Space[Floats]:
+    """Return the space of an observation (width,), not limited; the elements are listed in
+    docs/learning.md.
+    """
+    box: Any = Box(-np.inf, np.inf, (task.width,), np.float32)
+    return box
+
+
+def action_space(task: TrainingTask) -> Space[Floats]:
+    """Return the space of an action (actuators,): shares of the limits of a wrench, -1 to 1, or
+    open times of thrusters in shares of a tick, 0 to 1.
+    """
+    box: Any = Box(0.0 if task.pulsed else -1.0, 1.0, (task.actuators,), np.float32)
+    return box
+
+
+def require_one_chaser(scenario: Scenario) -> None:
+    """Raise ScenarioError for a scenario with several chasers."""
+    count = len(scenario.chasers)
+    if count != 1:
+        raise ScenarioError(
+            f"{scenario.name}: Gymnasium's environments have one chaser (got {count}); use "
+            "chaserdock.envs.parallel_env"
+        )
+
+
+def require_finite(action: object, name: str) -> None:
+    """Raise ValueError for an action with a number that is not finite."""
+    if not np.isfinite(np.asarray(action, dtype=float)).all():
+        raise ValueError(f"{name}: must be finite numbers")

@@ -7,7 +7,7 @@ the flight is judged against, as in ``summary``. A chaser has the same colour in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -397,7 +397,7 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
-def _require_led(errors: Mapping[int, Sequence[Any]]) -> None:
+def _require_led(errors: Mapping[int, Any]) -> None:
     """Raise MissingData if no chaser has times (K,), the first of its values, with an error."""
     if not any(len(time_s) for time_s, *_ in errors.values()):
         raise MissingData("no chaser was led relative to the target")

@@ -33,6 +33,7 @@ class ExportFormat(StrEnum):
     csv = "csv"
     tum = "tum"
     rosbag2 = "rosbag2"
+    glb = "glb"
 
 
 def _source(log: list[Path]) -> Path | list[Path]:
@@ -50,11 +51,12 @@ def log(
         typer.Option(
             help="--export: a table per topic as parquet (with types and units) or csv; tum: "
             "trajectories of truth, measured poses, estimate, odometry and references; rosbag2: a "
-            "bag of ROS 2 (MCAP), which needs chaserdock[ros2]"
+            "bag of ROS 2 (MCAP), which needs chaserdock[ros2]; glb: the surface of a target of "
+            "unknown shape, by the last map"
         ),
     ] = ExportFormat.parquet,
     images: Annotated[
-        bool, typer.Option("--images", help="--export: include the images; not in tum")
+        bool, typer.Option("--images", help="--export: include the images; not in tum, glb")
     ] = False,
     from_s: FromOpt = 0.0,
     to_s: ToOpt = None,
@@ -77,9 +79,9 @@ def log(
         refuse_options(context, ("format", "images"), "only with --export")
     else:
         refuse_options(context, ("as_json",), "not with --export")
-    if format is ExportFormat.tum:
-        refuse_options(context, ("images",), "not with --format tum")
-    else:
+    if format in (ExportFormat.tum, ExportFormat.glb):
+        refuse_options(context, ("images",), f"not with --format {format.value}")
+    if format is not ExportFormat.tum:
         refuse_options(context, ("from_s", "to_s"), "only with --format tum")
     if export is not None:
         _export(log, export, format, images, (from_s, math.inf if to_s is None else to_s))
@@ -111,6 +113,10 @@ def _export(
         from chaserdock.logs.tracks import write_tracks
 
         written, unit = write_tracks(source, out, *window_s), "points"
+    elif format is ExportFormat.glb:
+        from chaserdock.logs.mapped_shape import write_shape
+
+        written, unit = write_shape(source, out), "faces"
     elif format is ExportFormat.rosbag2:
         from chaserdock.logs.rosbag import export_bag
 

@@ -6,7 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 from chaserdock_protocol.messages import (
     Event,
     FeatureTracks,
@@ -16,12 +18,13 @@ from chaserdock_protocol.messages import (
     TargetEstimate,
     Tick,
 )
-from chaserdock_protocol.recording.log import read_log
+from chaserdock_protocol.recording.log import LogError, read_log
 from source_tree import ROOT
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.report import report_of
 from chaserdock.analysis.summary import summary_of
+from chaserdock.logs.mapped_shape import write_shape
 from chaserdock.simulation.mission import SimulatedFlight, simulate
 from chaserdock.summary import Summary
 
@@ -48,6 +51,21 @@ def test_the_report_of_a_survey_leaves_out_what_needs_a_reference(flight: Simula
     page = report_of(flight.folder)
     assert "Trajectories" in page
     assert "no chaser was led relative to the target" in page
+
+
+@pytest.mark.slow
+def test_the_surface_of_the_last_map_is_exported(flight: SimulatedFlight, tmp_path: Path) -> None:
+    written = write_shape(flight.folder, tmp_path / "shape")
+    assert written["target.glb"] > 200
+    scene = trimesh.load_scene(tmp_path / "shape" / "target.glb")
+    # The satellite is 1.28 m wide; in 14 s a third of it has been seen.
+    assert 0.8 < float(np.max(scene.extents)) < 1.6
+    assert set(scene.geometry) == {"seen", "unseen"}
+
+
+def test_a_log_without_a_map_has_no_surface(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="no map of a target: no mapper flew"):
+        write_shape(ROOT / "tests/golden/two-chasers.mcap", tmp_path)
 
 
 @pytest.mark.slow(0.1)

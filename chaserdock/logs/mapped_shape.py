@@ -27,7 +27,8 @@ _SEEN, _UNSEEN = (190, 190, 190, 255), (200, 70, 60, 255)
 
 def write_shape(log: LogSource, folder: Path) -> dict[str, int]:
     """Write ``FILE`` into a folder: the surface in the frame of the map (TRF), m, as two parts:
-    ``seen`` and, red, ``unseen``, which no camera has seen from outside. Returns the number of faces by file name.
+    ``seen`` and, red, ``unseen``, which no camera has seen from outside. Returns the number of
+    faces by file name.
 
     Raises LogError if the log has no map of a target, or the file cannot be written.
     """
@@ -40,8 +41,9 @@ def write_shape(log: LogSource, folder: Path) -> dict[str, int]:
         ("seen", surface.seen, _SEEN),
         ("unseen", ~surface.seen, _UNSEEN),
     ):
-        part = trimesh.Trimesh(surface.vertices_m, surface.triangles[faces], process=False)
-        part.visual.face_colors = colour
+        triangles = surface.triangles[faces]
+        colours = np.tile(np.array(colour, dtype=np.uint8), (len(triangles), 1))
+        part = trimesh.Trimesh(surface.vertices_m, triangles, face_colors=colours, process=False)
         if faces.any():
             scene.add_geometry(part, node_name=name, geom_name=name)
     with errors_of_writing(folder, LogError):

@@ -66,7 +66,8 @@ class AccurateEstimate(Check):
 
     name = "accurate estimate"
     exceptions = (
-        "in flights in which odometry or clocks are wrong, or messages damaged",
+        "in flights in which odometry or clocks are wrong, messages damaged, or the target's shape "
+        "unknown, so that its frame is that of a map",
         "with thrusters in a network that delays or loses their pulses",
         "while a thruster of a latched chaser is stuck on without a report "
         "([limitations.md](limitations.md#estimation))",
@@ -78,7 +79,8 @@ class AccurateEstimate(Check):
         causes = self.view.causes
         # Chasers do not know what late pulses lose.
         is_late = self.scenario.chaser.actuation == "thrusters" and causes.late_messages
-        self._is_judged = len(causes.liars) <= 1 and not causes.wrong_states and not is_late
+        known = len(causes.liars) <= 1 and not causes.wrong_states and not is_late
+        self._is_judged = known and not self.scenario.maps_target
 
     @reads(Sighting)
     def note_sighting(self, sighting: Sighting) -> None:
@@ -167,7 +169,10 @@ class CovarianceConsistency(Check):
     """
 
     name = NEES.invariant
-    exceptions = ("in flights with lying sensors, thruster failures or `[truth]`",)
+    exceptions = (
+        "in flights with lying sensors, thruster failures or `[truth]`",
+        "of a target of unknown shape, whose frame is that of a map",
+    )
 
     nees: list[float] = field(default_factory=list)
     relative_nees: dict[int, list[float]] = field(default_factory=dict)
@@ -175,7 +180,7 @@ class CovarianceConsistency(Check):
     @reads(TargetEstimate)
     def measure(self, estimate: TargetEstimate) -> None:
         truth = self.view.truth_of(estimate)
-        if truth is None or estimate.tick % self.scenario.time.rate_hz:
+        if truth is None or estimate.tick % self.scenario.time.rate_hz or self.scenario.maps_target:
             return
         true, known = ((np.array(x.position_m), np.array(x.q_wxyz)) for x in (truth, estimate))
         covariance = pose_covariance(estimate.covariance)

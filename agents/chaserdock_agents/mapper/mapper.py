@@ -21,8 +21,7 @@ from .adjustment import (
     AdjustmentTuning,
     Problem,
     adjust,
-    in_cameras,
-    residuals,
+    fit,
     triangulate,
     with_landmarks,
 )
@@ -78,8 +77,10 @@ class MapperTuning:
     """Landmarks whose median residual is larger slide along edges or shadows."""
     first_residual_px: float = 4.0
     """The same before a start is adjusted."""
+    slide_px: float = 1.5
+    """Standard deviation of the slide of a point, px for a turn of 1 rad."""
     fresh_px: float = 0.3
-    slide_px_s: float = 0.05
+    slide_px_s: float = 0.02
     """Standard deviation of a point at first, and its slide: 0.1 px/s on the grid of solar cells,
     0.3 px/s on foil, whose shading follows the light (docs/evidence/unknown.md). Smaller than
     both, as old points also tell what new ones do not."""
@@ -268,9 +269,7 @@ class Mapper:
         keys and prior; None if it explains nothing.
         """
         views, observations, keys = self._gathered(windows)
-        problem = Problem(
-            views, observations, self._cameras, self._focal_px, prior, self.tuning.noise_px
-        )
+        problem = self._problem(views, observations, prior, motion)
         estimate = MapEstimate(
             motion, np.zeros((len(self._cameras), CAMERA)), np.zeros((len(views.time_s), 3)),
             np.zeros((0, 3)),
@@ -298,10 +297,8 @@ class Mapper:
         assert self._last is not None
         assert self._prior is not None
         views, observations, keys = self.observations()
-        problem = Problem(
-            views, observations, self._cameras, self._focal_px, self._prior, self.tuning.noise_px
-        )
         last = self._last.estimate
+        problem = self._problem(views, observations, self._prior, last.motion)
         seen_at = list(zip(views.chaser.tolist(), views.time_s.tolist(), strict=True))
         turns = np.array([self._turns.get(at, np.zeros(3)) for at in seen_at])
         start = MapEstimate(last.motion, last.cameras, turns, last.landmarks_m)
@@ -339,6 +336,20 @@ class Mapper:
         )  # fmt: skip
 
     # -- Gathering ---------------------------------------------------------------------------------
+
+    def _problem(
+        self,
+        views: CameraViews,
+        observations: Observations,
+        prior: ConstantRates,
+        motion: ConstantRates,
+    ) -> Problem:
+        """Return the adjustment of observations to a target about as fast as ``motion``."""
+        slide_px_s = self.tuning.slide_px * float(np.linalg.norm(motion.omega_rad_s))
+        return Problem(
+            views, observations, self._cameras, self._focal_px, prior, self.tuning.noise_px,
+            max(slide_px_s, _LEAST_SLIDE_PX_S),
+        )  # fmt: skip
 
     def _gathered(
         self, windows: Sequence[Sequence[ImageTracks]]
@@ -408,6 +419,8 @@ class Mapper:
         return replace(problem, observations=part), with_landmarks(start, points[good]), keys[good]
 
 
+_LEAST_SLIDE_PX_S = 1e-3
+"""Slide of points on a target that hardly turns."""
 _SLACK_S = 1e-6
 """Difference of two times, s, that are the same but for rounding."""
 _ASSUMED_M = 2.0
@@ -424,8 +437,9 @@ _MOST_TRACKS = 4000
 
 def _off_px(problem: Problem, estimate: MapEstimate) -> Array:
     """Return by how much each observation (k,) is off its landmark; the cap for one behind."""
-    off = np.linalg.norm(residuals(problem, estimate), axis=1)
-    off[in_cameras(problem, estimate)[:, 2] < _BEHIND_M] = _CAP_PX
+    found = fit(problem, estimate, AdjustmentTuning().robust_px)
+    off = np.linalg.norm(found.residual, axis=1)
+    off[found.depth_m < _BEHIND_M] = _CAP_PX
     return off
 
 

@@ -350,8 +350,9 @@ def _off_prior(problem: Problem, estimate: MapEstimate) -> Array:
 
 def _prior_sigmas(problem: Problem) -> Array:
     motion = np.repeat([_POSITION_PRIOR_M, _VELOCITY_PRIOR_M_S, _RATE_PRIOR_RAD_S], 3)
+    mean_px_s = _MEAN_SLIDE * problem.slide_px_s
     cameras = [
-        np.array([*[c.turn_rad] * 3, *[c.shift_m] * 3, c.focal_share, *[_SLIDE_PX_S] * 2])
+        np.array([*[c.turn_rad] * 3, *[c.shift_m] * 3, c.focal_share, *[mean_px_s] * 2])
         for c in problem.cameras
     ]
     noise = np.array([view_turn_sigma_rad(c) for c in problem.cameras])
@@ -378,8 +379,9 @@ def view_turn_sigma_rad(camera: CameraUncertainty) -> float:
     return float(np.hypot(camera.attitude_noise_rad, camera.position_noise_m / _USUAL_RANGE_M))
 
 
-_SLIDE_PX_S = 0.1
-"""Standard deviation of the mean slide of a camera's points: shading follows the light."""
+_MEAN_SLIDE = 0.6
+"""Standard deviation of the mean slide of a camera's points, share of that of one point: shading
+follows the light."""
 _POSITION_PRIOR_M = 0.5
 """Standard deviation of the first guess of the target's position: the cameras' lines of sight to
 the middle of the moving points."""

@@ -77,8 +77,9 @@ class MapperTuning:
     """Landmarks whose median residual is larger slide along edges or shadows."""
     first_residual_px: float = 4.0
     """The same before a start is adjusted."""
-    slide_px: float = 1.5
-    """Standard deviation of the slide of a point, px for a turn of 1 rad."""
+    slide_px: float = 3.0
+    """Standard deviation of the slide of a point, px for a turn of 1 rad: 1 to 4 between 3 and 15 s
+    after it was found (docs/evidence/unknown.md)."""
     fresh_px: float = 0.3
     slide_px_s: float = 0.02
     """Standard deviation of a point at first, and its slide: 0.1 px/s on the grid of solar cells,

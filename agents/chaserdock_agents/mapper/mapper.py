@@ -88,6 +88,12 @@ class MapperTuning:
     noise_px: float = 1.2
     """Noise of a coordinate as if views were independent. Points stray by 0.25 px, but alike in
     some ten views in a row, and neighbours together (NEES: docs/evidence/unknown.md)."""
+    open_factor: float = 2.0
+    """Factor of the motion's standard deviations until a side of the target has returned: slides of
+    points that are alike look like motion (NEES: docs/evidence/unknown.md)."""
+    closing_tracks: int = 30
+    """Tracks that must span most of a turn before a side has returned: two recalls of the fewest
+    points that a tracker accepts."""
     start_s: float = 4.0
     """Shortest span of views from which a start is tried."""
     least_points: int = 40
@@ -116,7 +122,8 @@ class TargetMap:
     ``motion`` and what follows are None, empty or infinite without a map. ``covariance`` (9, 9): of
     the motion's vector. ``cameras`` (chasers, 9): see `MapEstimate`. ``keys`` (n,): of landmarks,
     ``landmarks_m`` (n, 3), TRF, ``covariances_m2`` (n, 3, 3). ``scale_share``: standard deviation
-    of all distances.
+    of all distances. ``closed``: whether a side of the target was seen again after a turn; before,
+    the size of the rate is some tenths of a percent wrong.
     """
 
     time_s: float
@@ -130,6 +137,7 @@ class TargetMap:
     scale_share: float = float("inf")
     residual_px: float = float("inf")
     merges: int = 0
+    closed: bool = False
 
 
 class Mapper:
@@ -321,19 +329,31 @@ class Mapper:
         self.merges.check(part.observations, adjusted.residual_px, chosen)
         self.merges.find(part.observations, adjusted, chosen)
         self.merges.forget(np.unique(observations.track))
-        return self._described(time_s, adjusted, chosen)
+        closed = self._closed(part, adjusted.estimate.motion)
+        return self._described(time_s, adjusted, chosen, closed)
 
-    def _described(self, time_s: float, found: Adjusted, keys: IntArray) -> TargetMap:
+    def _closed(self, problem: Problem, motion: ConstantRates) -> bool:
+        """Return whether enough tracks span most of a turn."""
+        of, seen_s = problem.tracks.of, problem.views.time_s[problem.observations.view]
+        count = len(problem.tracks.landmark)
+        first, last = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(first, of, seen_s)
+        np.maximum.at(last, of, seen_s)
+        turned = (last - first) * float(np.linalg.norm(motion.omega_rad_s))
+        return int((turned > _MOST_OF_TURN_RAD).sum()) >= self.tuning.closing_tracks
+
+    def _described(self, time_s: float, found: Adjusted, keys: IntArray, closed: bool) -> TargetMap:
         estimate = found.estimate
+        factor = 1.0 if closed else self.tuning.open_factor
         away = [v[-1].position_w_m for v in self._views if v]
         line = found.centre_m - away[0] if away else found.centre_m
         range_m = float(np.linalg.norm(line))
         scale = float(np.sqrt(line @ found.centre_covariance_m2 @ line)) / range_m**2
         status: Status = "mapped" if scale < self.tuning.scale_share else "scale unknown"
         return TargetMap(
-            time_s, status, estimate.motion, found.covariance[:9, :9], estimate.cameras, keys,
-            estimate.landmarks_m, found.landmark_covariances_m2, scale,
-            float(np.median(found.residual_px)), self.merges.count,
+            time_s, status, estimate.motion, factor**2 * found.covariance[:9, :9],
+            estimate.cameras, keys, estimate.landmarks_m, found.landmark_covariances_m2, scale,
+            float(np.median(found.residual_px)), self.merges.count, closed,
         )  # fmt: skip
 
     # -- Gathering ---------------------------------------------------------------------------------
@@ -422,6 +442,8 @@ class Mapper:
 
 _LEAST_SLIDE_PX_S = 1e-3
 """Slide of points on a target that hardly turns."""
+_MOST_OF_TURN_RAD = 4.5
+"""Turn, 260 degrees, over which no point stays in view."""
 _SLACK_S = 1e-6
 """Difference of two times, s, that are the same but for rounding."""
 _ASSUMED_M = 2.0

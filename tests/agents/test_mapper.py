@@ -18,6 +18,8 @@ WHITE = MapperTuning(noise_px=NOISE_PX)
 """For points whose errors are independent, unlike those of tracks in images."""
 FEW = StartTuning(directions=14, rates_rad_s=(0.05,), steps=10, pair_tracks=60)
 """Fewer starts, for time."""
+SLIDE_PX_S = 0.15
+"""Standard deviation of how fast points slide."""
 
 
 def mapped(target: PointTarget, until_s: float, tuning: MapperTuning = WHITE) -> list[TargetMap]:
@@ -53,6 +55,39 @@ def test_motion_is_recovered_with_a_consistent_covariance() -> None:
     # Of 6, less two fifths: points with large residuals count for less.
     assert 1.5 < np.mean(nees) < 9.0
     assert max(shares) < 0.01
+
+
+def sliding(target: PointTarget, until_s: float) -> list[ImageTracks]:
+    """Return images whose points slide while they are followed, each in its own direction."""
+    slides = np.random.default_rng(target.seed).normal(0.0, SLIDE_PX_S / FOCAL_PX, (10000, 2))
+    since: dict[tuple[int, int], float] = {}
+    out = []
+    for image in target.images(until_s):
+        begin = [since.setdefault((image.chaser, i), image.time_s) for i in image.ids.tolist()]
+        ages_s = image.time_s - np.array(begin)
+        rays = image.rays + slides[image.ids] * ages_s[:, None]
+        out.append(replace(image, rays=rays, ages_s=ages_s))
+    return out
+
+
+@pytest.mark.slow(0.2)
+def test_points_that_slide_leave_the_motion_consistent() -> None:
+    nees = []
+    for slide_px in (SLIDE_PX_S / float(np.linalg.norm(TRUE.omega_rad_s)), 1e-3):
+        tuning = replace(WHITE, slide_px=slide_px, slide_px_s=0.0, open_factor=1.0)
+        found = []
+        for seed in range(2):
+            mapper = Mapper([LAB] * 2, FOCAL_PX, tuning, FEW)
+            for image in sliding(PointTarget(seed), 16.0):
+                mapper.add(image)
+                if image.chaser == 1 and image.time_s > 3.9 and round(image.time_s, 1) % 4 == 0:
+                    last = mapper.update(image.time_s)
+            error = error_of(last)
+            found.append(float(error @ np.linalg.solve(last.covariance[3:, 3:], error)))
+        nees.append(np.mean(found))
+    # Of 6; the second mapper takes the points for fixed ones.
+    assert nees[0] < 12.0
+    assert nees[1] > 2.0 * nees[0]
 
 
 @pytest.mark.slow(0.1)

@@ -148,7 +148,7 @@ def _geometry(problem: Problem, estimate: MapEstimate) -> _Geometry:
     return _Geometry(turned, to_camera, from_w, points)
 
 
-class Fit(NamedTuple):
+class MapFit(NamedTuple):
     """How observations fit an estimate whose slides are those of least cost: the estimate, weighted
     residuals (k, 2), px, which are large for landmarks behind a camera, and depths (k,), m.
     """
@@ -158,7 +158,7 @@ class Fit(NamedTuple):
     depth_m: Array
 
 
-def fit(problem: Problem, estimate: MapEstimate, robust_px: float) -> Fit:
+def fit(problem: Problem, estimate: MapEstimate, robust_px: float) -> MapFit:
     """Return how observations fit motion, cameras, turns and landmarks of an estimate."""
     y, tracks = _geometry(problem, estimate).points, problem.tracks
     slides = np.zeros((len(tracks.landmark), 2))
@@ -169,7 +169,7 @@ def fit(problem: Problem, estimate: MapEstimate, robust_px: float) -> Fit:
         stiff = tracks.sums(weight * tracks.lever_s**2) + _slide_information(problem, slides)
         slides = -tracks.sums((weight * tracks.lever_s)[:, None] * still) / stiff[:, None]
         residual = still + tracks.lever_s[:, None] * slides[tracks.of]
-    return Fit(replace(estimate, slides_px_s=slides), residual, y[:, 2])
+    return MapFit(replace(estimate, slides_px_s=slides), residual, y[:, 2])
 
 
 _SLIDE_ROUNDS = 3

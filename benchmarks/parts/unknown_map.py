@@ -7,7 +7,8 @@ and what it knows goes back to the trackers. Nothing else reaches them: no truth
 
 ``first``: time to the first map, which is false if its rate is 10 % wrong. ``half``, ``turn``:
 after half a turn and one. ``size``, ``direction``: of the rate's error; ``mounting``: direction by
-which the cameras' unknown mounting alone turns it. ``next``: poses over the next turn, each by the
+which the cameras' unknown mounting alone turns it. ``closed``: when the mapper says that a side has
+returned, and poses from then on. ``next``: poses over the next turn, each by the
 latest map before it, against the frame of the map; landmarks against the surface in the frame of
 the last map. NEES is of velocity and rate (6). Times are CPU times of this process.
 """
@@ -37,7 +38,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.satellites import satellite, satellite_names
 from chaserdock_world.sensors.errors import camera_errors
-from common import Figures, Group, KeptResults, Options, seeds_of
+from common import BenchmarkFailed, Figures, Group, KeptResults, Options, seeds_of
 
 from .unknown_scene import SUNS, TUMBLES, SceneCase, UnknownImages
 
@@ -65,6 +66,12 @@ class MapOutcome:
     turn_size_share: float = math.nan
     turn_direction_rad: float = math.nan
     mounting_direction_rad: float = math.nan
+    closed_turns: float = math.nan
+    closed_rate_share: float = math.nan
+    closed_direction_rad: float = math.nan
+    closed_nees: float = math.nan
+    closed_position_m: float = math.nan
+    closed_angle_rad: float = math.nan
     turn_nees: float = math.nan
     turn_scale_share: float = math.nan
     next_offset_m: float = math.nan
@@ -100,6 +107,7 @@ def fly(case: SceneCase, folder: Path) -> MapOutcome:
     first: TargetMap | None = None
     after_half: TargetMap | None = None
     after_turn: TargetMap | None = None
+    closed: TargetMap | None = None
     last: TargetMap | None = None
     next_s, image_s, mapper_s, points = 1.0, [], 0.0, 0.0
     times, motions = [], []
@@ -135,6 +143,8 @@ def fly(case: SceneCase, folder: Path) -> MapOutcome:
         if not mapped or found.motion is None:
             continue
         last = found
+        if closed is None and found.closed:
+            closed = found
         first = first or found
         known = [KnownTarget(found.motion, *mapper.known_points(k)) for k in range(chasers)]
         if after_half is None and at_s >= 0.5 * case.turn_s:
@@ -149,6 +159,18 @@ def fly(case: SceneCase, folder: Path) -> MapOutcome:
     )
     if first is None or last is None or after_half is None or after_turn is None or not times:
         return outcome
+    if closed is not None and times[-1] > closed.time_s + UPDATE_S:
+        later = int(np.searchsorted(times, closed.time_s))
+        since = pose_errors(images, np.array(times[later:]), motions[later:])
+        outcome = replace(
+            outcome,
+            closed_turns=closed.time_s / case.turn_s,
+            closed_rate_share=rate_share(case, closed),
+            closed_direction_rad=size_and_direction(case, closed)[1],
+            closed_nees=rate_nees(case, closed),
+            closed_position_m=since.position_m,
+            closed_angle_rad=since.angle_rad,
+        )
     errors = pose_errors(images, np.array(times), motions)
     distance = surface_distances(case.mesh, (last.landmarks_m - errors.origin_m) @ errors.turn)
     return replace(
@@ -354,12 +376,81 @@ def measure(options: Options) -> Figures:
         if len(known):
             figures[f"{name}_median"] = float(np.median(np.abs(known)))
             figures[f"{name}_max"] = float(np.abs(known).max())
-    for name in ("half_nees", "turn_nees"):
+    for name in ("half_nees", "turn_nees", "closed_nees"):
         known = rows[name][np.isfinite(rows[name])]
         if len(known):
             figures[f"{name}_mean"] = float(known.mean())
     return figures
 
+
+REFUSED_S = 30.0
+"""Duration of a sequence that must give no map: six times that of a usual start."""
+
+
+@dataclass(frozen=True)
+class RefusalOutcome:
+    """States of the mapper while it must not give a map with distances: the last one, whether any
+    was `mapped`, and the standard deviation of the scale, as a share, where a map has none.
+    """
+
+    status: str
+    mapped: bool
+    scale_share: float = math.nan
+
+
+def refused(case: SceneCase, folder: Path) -> RefusalOutcome:
+    """Return what the mapper says in a sequence."""
+    images = UnknownImages(case, folder)
+    camera, chasers = images.camera, len(case.places_m)
+    trackers = [FeatureTracker(camera) for _ in range(chasers)]
+    mapper = Mapper([uncertainty(images)] * chasers, camera.fx_px)
+    next_s, found, mapped = 1.0, TargetMap(0.0, "gathering"), False
+    for exposure in images.exposures():
+        i, at_s, own = exposure.chaser, exposure.time_s, exposure.odometry
+        lens, q = camera.irf_pose_in_world(own.position_m, own.q_wxyz)
+        seen = trackers[i].track(exposure.image, at_s, lens, q)
+        rays = camera.normalized(seen.px)
+        mapper.add(ImageTracks(i, at_s, lens, rotations.to_matrix(q), seen.ids, rays, seen.ages_s))
+        if i == chasers - 1 and at_s >= next_s:
+            found = mapper.update(at_s)
+            mapped |= found.status == "mapped"
+            next_s = at_s + (UPDATE_S if found.motion is not None else 1.0)
+    return RefusalOutcome(found.status, mapped, found.scale_share)
+
+
+def measure_refused(options: Options) -> Figures:
+    """Measure what gives no map: one chaser, whose scale is unknown, and a target that stands
+    still. Raises BenchmarkFailed if anything is `mapped`.
+    """
+    figures: Figures = {}
+    for name, expected in _REFUSALS.items():
+        outcomes = []
+        for seed in seeds_of(options, 20, 1):
+            case = replace(case_of(options, seed), duration_s=REFUSED_S)
+            if name == "single":
+                case = replace(case, places_m=case.places_m[:1])
+            else:
+                case = replace(case, omega_rad_s=(0.0, 0.0, 0.0))
+            key = {"refused": name, "mesh": case.mesh, "sun": list(case.to_sun),
+                   "omega": [round(v, 6) for v in case.omega_rad_s]}  # fmt: skip
+            outcomes += KeptResults(options.results, key, RefusalOutcome).of(
+                [seed],
+                lambda seed, case=case: refused(replace(case, seed=seed), options.images),
+                lambda o, name=name: f"{name}: {o.status}",
+            )
+        figures[f"{name}_sequences"] = len(outcomes)
+        figures[f"{name}_named"] = float(sum(o.status in expected for o in outcomes))
+        figures[f"{name}_mapped"] = float(sum(o.mapped for o in outcomes))
+    if any(v for k, v in figures.items() if k.endswith("_mapped")):
+        raise BenchmarkFailed("a map where there must be none", figures)
+    return figures
+
+
+_REFUSALS = {
+    "single": ("scale unknown", "ambiguous"),
+    "still": ("does not turn", "no texture"),
+}
+"""What the mapper may say at the end, by sequence. A tracker shows no point that does not move."""
 
 _FIELDS = tuple(MapOutcome.__dataclass_fields__)
 
@@ -371,6 +462,8 @@ def _flown(case: SceneCase, folder: Path, seed: int) -> MapOutcome:
 def _line(o: MapOutcome) -> str:
     return (
         f"first {o.first_s:.0f} s, rate {1e2 * o.turn_rate_share:.3f} %, NEES {o.turn_nees:.1f}, "
+        f"closed {o.closed_turns:.2f}: {1e2 * o.closed_rate_share:.3f} %, {o.closed_nees:.1f}, "
+        f"{1e3 * o.closed_position_m:.2f} mm {np.rad2deg(o.closed_angle_rad):.3f} deg; "
         f"next turn {1e3 * o.next_position_m:.2f} mm {np.rad2deg(o.next_angle_rad):.3f} deg"
     )
 
@@ -391,4 +484,9 @@ def _add_options(parser: ArgumentParser) -> None:
     )  # fmt: skip
 
 
-GROUP = Group({"map": measure}, uses=("flights", "first", "results"), add_options=_add_options)
+GROUP = Group(
+    {"map": measure, "refused": measure_refused},
+    on_request=("refused",),
+    uses=("flights", "first", "results"),
+    add_options=_add_options,
+)

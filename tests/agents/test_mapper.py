@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from chaserdock_agents.mapper.types import ConstantRates, ImageTracks
 from chaserdock_models import rotations
 from unknown_cases import FOCAL_PX, LAB, NOISE_PX, TRUE, PointTarget
 
-WHITE = MapperTuning(noise_px=NOISE_PX)
+WHITE = MapperTuning(noise_px=NOISE_PX, open_factor=1.0)
 """For points whose errors are independent, unlike those of tracks in images."""
 FEW = StartTuning(directions=14, rates_rad_s=(0.05,), steps=10, pair_tracks=60)
 """Fewer starts, for time."""
@@ -24,14 +25,21 @@ SLIDE_PX_S = 0.15
 
 def mapped(target: PointTarget, until_s: float, tuning: MapperTuning = WHITE) -> list[TargetMap]:
     """Return the maps of updates every two seconds."""
-    mapper = Mapper([LAB] * target.chasers, FOCAL_PX, tuning, FEW)
+    return maps_of(target.images(until_s), target.chasers, tuning, 2.0)
+
+
+def maps_of(
+    images: Iterable[ImageTracks], chasers: int, tuning: MapperTuning, period_s: float
+) -> list[TargetMap]:
+    """Return the maps of updates every ``period_s``, from 4 s on."""
+    mapper = Mapper([LAB] * chasers, FOCAL_PX, tuning, FEW)
     out: list[TargetMap] = []
     next_s = 4.0
-    for image in target.images(until_s):
+    for image in images:
         mapper.add(image)
-        if image.chaser == target.chasers - 1 and image.time_s >= next_s - 1e-6:
+        if image.chaser == chasers - 1 and image.time_s >= next_s - 1e-6:
             out.append(mapper.update(image.time_s))
-            next_s += 2.0
+            next_s += period_s
     return out
 
 
@@ -74,14 +82,10 @@ def sliding(target: PointTarget, until_s: float) -> list[ImageTracks]:
 def test_points_that_slide_leave_the_motion_consistent() -> None:
     nees = []
     for slide_px in (SLIDE_PX_S / float(np.linalg.norm(TRUE.omega_rad_s)), 1e-3):
-        tuning = replace(WHITE, slide_px=slide_px, slide_px_s=0.0, open_factor=1.0)
+        tuning = replace(WHITE, slide_px=slide_px, slide_px_s=0.0)
         found = []
         for seed in range(2):
-            mapper = Mapper([LAB] * 2, FOCAL_PX, tuning, FEW)
-            for image in sliding(PointTarget(seed), 16.0):
-                mapper.add(image)
-                if image.chaser == 1 and image.time_s > 3.9 and round(image.time_s, 1) % 4 == 0:
-                    last = mapper.update(image.time_s)
+            last = maps_of(sliding(PointTarget(seed), 16.2), 2, tuning, 4.0)[-1]
             error = error_of(last)
             found.append(float(error @ np.linalg.solve(last.covariance[3:, 3:], error)))
         nees.append(np.mean(found))

@@ -278,8 +278,9 @@ class _Normal:
         observations with theirs.
         """
         chasers, size = self._shape
-        out = np.zeros((gather.shape[0], cross.shape[1], size))
-        out[:, :, :MOTION] = _gathered(gather, cross[:, :, :MOTION])
+        by_motion = _gathered(gather, cross[:, :, :MOTION])
+        out = np.zeros((*by_motion.shape[:2], size))
+        out[:, :, :MOTION] = by_motion
         for chaser in range(chasers):
             own = (self._chaser == chaser)[:, None, None]
             at = MOTION + CAMERA * chaser

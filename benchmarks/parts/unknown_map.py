@@ -159,18 +159,20 @@ def fly(case: SceneCase, folder: Path) -> MapOutcome:
     )
     if first is None or last is None or after_half is None or after_turn is None or not times:
         return outcome
-    if closed is not None and times[-1] > closed.time_s + UPDATE_S:
-        later = int(np.searchsorted(times, closed.time_s))
-        since = pose_errors(images, np.array(times[later:]), motions[later:])
+    if closed is not None:
         outcome = replace(
             outcome,
             closed_turns=closed.time_s / case.turn_s,
             closed_rate_share=rate_share(case, closed),
             closed_direction_rad=size_and_direction(case, closed)[1],
             closed_nees=rate_nees(case, closed),
-            closed_position_m=since.position_m,
-            closed_angle_rad=since.angle_rad,
         )
+        later = int(np.searchsorted(times, closed.time_s))
+        if times[-1] > closed.time_s + 0.5 * case.turn_s:
+            since = pose_errors(images, np.array(times[later:]), motions[later:])
+            outcome = replace(
+                outcome, closed_position_m=since.position_m, closed_angle_rad=since.angle_rad
+            )
     errors = pose_errors(images, np.array(times), motions)
     distance = surface_distances(case.mesh, (last.landmarks_m - errors.origin_m) @ errors.turn)
     return replace(

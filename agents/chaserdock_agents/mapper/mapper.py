@@ -88,12 +88,12 @@ class MapperTuning:
     noise_px: float = 1.2
     """Noise of a coordinate as if views were independent. Points stray by 0.25 px, but alike in
     some ten views in a row, and neighbours together (NEES: docs/evidence/unknown.md)."""
-    open_factor: float = 2.0
+    open_factor: float = 2.5
     """Factor of the motion's standard deviations until a side of the target has returned: slides of
     points that are alike look like motion (NEES: docs/evidence/unknown.md)."""
     closing_tracks: int = 30
-    """Tracks that must span most of a turn before a side has returned: two recalls of the fewest
-    points that a tracker accepts."""
+    """Tracks that must be found again before a side has returned: two recalls of the fewest points
+    that a tracker accepts."""
     start_s: float = 4.0
     """Shortest span of views from which a start is tried."""
     least_points: int = 40
@@ -333,14 +333,12 @@ class Mapper:
         return self._described(time_s, adjusted, chosen, closed)
 
     def _closed(self, problem: Problem, motion: ConstantRates) -> bool:
-        """Return whether enough tracks span most of a turn."""
+        """Return whether enough tracks were found again after a part of a turn without them."""
         of, seen_s = problem.tracks.of, problem.views.time_s[problem.observations.view]
-        count = len(problem.tracks.landmark)
-        first, last = np.full(count, np.inf), np.full(count, -np.inf)
-        np.minimum.at(first, of, seen_s)
-        np.maximum.at(last, of, seen_s)
-        turned = (last - first) * float(np.linalg.norm(motion.omega_rad_s))
-        return int((turned > _MOST_OF_TURN_RAD).sum()) >= self.tuning.closing_tracks
+        order = np.lexsort((seen_s, of))
+        turned = np.diff(seen_s[order]) * float(np.linalg.norm(motion.omega_rad_s))
+        again = (np.diff(of[order]) == 0) & (turned > _UNSEEN_RAD)
+        return len(np.unique(of[order][1:][again])) >= self.tuning.closing_tracks
 
     def _described(self, time_s: float, found: Adjusted, keys: IntArray, closed: bool) -> TargetMap:
         estimate = found.estimate
@@ -442,8 +440,9 @@ class Mapper:
 
 _LEAST_SLIDE_PX_S = 1e-3
 """Slide of points on a target that hardly turns."""
-_MOST_OF_TURN_RAD = 4.5
-"""Turn, 260 degrees, over which no point stays in view."""
+_UNSEEN_RAD = 2.0
+"""Turn without a point after which it has returned: a side is out of view for more than half a
+turn."""
 _SLACK_S = 1e-6
 """Difference of two times, s, that are the same but for rounding."""
 _ASSUMED_M = 2.0

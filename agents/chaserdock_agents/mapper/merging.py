@@ -26,12 +26,11 @@ Descriptions = dict[int, list[tuple[float, Array]]]
 class MergingTuning:
     """Numbers of merging, with units and reasons."""
 
-    distance_m: float = 0.008
-    """Largest distance of landmarks that may be one. Points at 10 mm from each other merged turn
-    the axis of rotation: NEES of exact points 4 without merges, 10 with them."""
-    unlike: float = 0.4
-    """Largest distance of unit descriptions: at 0.5, one in fifty pairs of different points is as
-    alike."""
+    distance_m: float = 0.012
+    """Largest distance of landmarks that may be one. Wrong merges turn the axis of rotation, fewer
+    ones leave the scale less certain (docs/evidence/unknown.md)."""
+    unlike: float = 0.5
+    """Largest distance of unit descriptions: one in fifty pairs of different points is as alike."""
     kept: int = 6
     apart_s: float = 5.0
     """Descriptions kept of a track, the latest, and the time between them, 16 degrees of turn: a

@@ -91,9 +91,9 @@ class MapperTuning:
     open_factor: float = 2.5
     """Factor of the motion's standard deviations until a side of the target has returned: slides of
     points that are alike look like motion (NEES: docs/evidence/unknown.md)."""
-    closing_tracks: int = 30
-    """Tracks that must be found again before a side has returned: two recalls of the fewest points
-    that a tracker accepts."""
+    closing_tracks: int = 100
+    """Tracks that must be found again before a side has returned: a third of those in an image.
+    With 30, when the first recalls arrive, the motion is not corrected yet (NEES 22)."""
     start_s: float = 4.0
     """Shortest span of views from which a start is tried."""
     least_points: int = 40

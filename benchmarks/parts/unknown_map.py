@@ -8,9 +8,9 @@ and what it knows goes back to the trackers. Nothing else reaches them: no truth
 ``first``: time to the first map, which is false if its rate is 10 % wrong. ``half``, ``turn``:
 after half a turn and one. ``size``, ``direction``: of the rate's error; ``mounting``: direction by
 which the cameras' unknown mounting alone turns it. ``closed``: when the mapper says that a side has
-returned, and poses from then on. ``next``: poses over the next turn, each by the
-latest map before it, against the frame of the map; landmarks against the surface in the frame of
-the last map. NEES is of velocity and rate (6). Times are CPU times of this process.
+returned, and poses from then on. ``next``: poses over the next turn (with ``--quick``: over 8 s),
+each by the latest map before it, against the frame of the map; landmarks against the surface in the
+frame of the last map. NEES is of velocity and rate (6). Times are CPU times of this process.
 """
 
 from __future__ import annotations

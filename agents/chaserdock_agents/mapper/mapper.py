@@ -82,8 +82,8 @@ class MapperTuning:
     after it was found (docs/evidence/unknown.md)."""
     fresh_px: float = 0.3
     slide_px_s: float = 0.02
-    """Standard deviation of a point at first, and of what it strays beside a constant slide: 0.15 to
-    0.3 px in 8 s and more (docs/evidence/unknown.md)."""
+    """Standard deviation of a point at first, and of what it strays beside a constant slide: 0.15
+    to 0.3 px in 8 s and more (docs/evidence/unknown.md)."""
     noise_px: float = 1.2
     """Noise of a coordinate as if views were independent. Points stray by 0.25 px, but alike in
     some ten views in a row, and neighbours together (NEES: docs/evidence/unknown.md)."""

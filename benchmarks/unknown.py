@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A target of unknown shape: map and motion from what two chasers see.
 
-``python benchmarks/unknown.py [--mesh NAME] [--sun X Y Z] [--rate-deg-s RATE] [--flights N]``
+``python benchmarks/unknown.py [--suns NAME ...] [--rates-deg-s RATE ...] [--flights N]
+[--results FILE]``
 """
 
 from common import main

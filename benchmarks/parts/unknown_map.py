@@ -5,10 +5,12 @@ Two chasers hold 2 m beside the target for two turns (`unknown_scene`). Points o
 tracked, the mapper is updated every second before its first map and every ``UPDATE_S`` after it,
 and what it knows goes back to the trackers. Nothing else reaches them: no truth, no mesh.
 
-``first``: time to the first map, which is false if its rate is 10 % wrong. ``turn``: after one
-turn. ``next``: poses over the next turn, each by the latest map before it, against the frame of the
-map; landmarks against the surface in the frame of the last map. NEES
-is of velocity and rate (6), after a turn. Times are CPU times of this process.
+``first``: time to the first map, which is false if its rate is 10 % wrong. ``half``, ``turn``:
+after half a turn and one. ``size``, ``direction``: of the rate's error; ``mounting``: direction by
+which the cameras' unknown mounting alone turns it. ``closed``: when the mapper says that a side has
+returned, and poses from then on. ``next``: poses over the next turn (with ``--quick``: over 8 s),
+each by the latest map before it, against the frame of the map; landmarks against the surface in the
+frame of the last map. NEES is of velocity and rate (6). Times are CPU times of this process.
 """
 
 from __future__ import annotations
@@ -35,9 +37,10 @@ from chaserdock_agents.mapper.types import CameraUncertainty, ConstantRates, Ima
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.satellites import satellite, satellite_names
-from common import Figures, Group, KeptResults, Options, seeds_of
+from chaserdock_world.sensors.errors import camera_errors
+from common import BenchmarkFailed, Figures, Group, KeptResults, Options, seeds_of
 
-from .unknown_scene import SceneCase, UnknownImages
+from .unknown_scene import SUNS, TUMBLES, SceneCase, UnknownImages
 
 UPDATE_S = 6.0
 """Between updates of a map: 0.3 to 0.6 of a core (docs/evidence/unknown.md)."""
@@ -57,7 +60,18 @@ class MapOutcome:
     bytes_per_s: float
     first_s: float = math.nan
     first_rate_share: float = math.nan
+    half_rate_share: float = math.nan
+    half_nees: float = math.nan
     turn_rate_share: float = math.nan
+    turn_size_share: float = math.nan
+    turn_direction_rad: float = math.nan
+    mounting_direction_rad: float = math.nan
+    closed_turns: float = math.nan
+    closed_rate_share: float = math.nan
+    closed_direction_rad: float = math.nan
+    closed_nees: float = math.nan
+    closed_position_m: float = math.nan
+    closed_angle_rad: float = math.nan
     turn_nees: float = math.nan
     turn_scale_share: float = math.nan
     next_offset_m: float = math.nan
@@ -91,7 +105,9 @@ def fly(case: SceneCase, folder: Path) -> MapOutcome:
     mapper = Mapper([uncertainty(images)] * chasers, camera.fx_px)
     known: list[KnownTarget | None] = [None] * chasers
     first: TargetMap | None = None
+    after_half: TargetMap | None = None
     after_turn: TargetMap | None = None
+    closed: TargetMap | None = None
     last: TargetMap | None = None
     next_s, image_s, mapper_s, points = 1.0, [], 0.0, 0.0
     times, motions = [], []
@@ -127,8 +143,12 @@ def fly(case: SceneCase, folder: Path) -> MapOutcome:
         if not mapped or found.motion is None:
             continue
         last = found
+        if closed is None and found.closed:
+            closed = found
         first = first or found
         known = [KnownTarget(found.motion, *mapper.known_points(k)) for k in range(chasers)]
+        if after_half is None and at_s >= 0.5 * case.turn_s:
+            after_half = found
         if after_turn is None and at_s >= case.turn_s:
             after_turn = found
     outcome = MapOutcome(
@@ -137,15 +157,34 @@ def fly(case: SceneCase, folder: Path) -> MapOutcome:
         mapper_s / case.duration_s,
         BYTES_PER_POINT * points / case.duration_s / chasers,
     )
-    if first is None or last is None or after_turn is None or not times:
+    if first is None or last is None or after_half is None or after_turn is None or not times:
         return outcome
+    if closed is not None:
+        outcome = replace(
+            outcome,
+            closed_turns=closed.time_s / case.turn_s,
+            closed_rate_share=rate_share(case, closed),
+            closed_direction_rad=size_and_direction(case, closed)[1],
+            closed_nees=rate_nees(case, closed),
+        )
+        later = int(np.searchsorted(times, closed.time_s))
+        if times[-1] > closed.time_s + 0.5 * case.turn_s:
+            since = pose_errors(images, np.array(times[later:]), motions[later:])
+            outcome = replace(
+                outcome, closed_position_m=since.position_m, closed_angle_rad=since.angle_rad
+            )
     errors = pose_errors(images, np.array(times), motions)
     distance = surface_distances(case.mesh, (last.landmarks_m - errors.origin_m) @ errors.turn)
     return replace(
         outcome,
         first_s=first.time_s,
         first_rate_share=rate_share(case, first),
+        half_rate_share=rate_share(case, after_half),
+        half_nees=rate_nees(case, after_half),
         turn_rate_share=rate_share(case, after_turn),
+        turn_size_share=size_and_direction(case, after_turn)[0],
+        turn_direction_rad=size_and_direction(case, after_turn)[1],
+        mounting_direction_rad=mounting_direction(images),
         turn_nees=rate_nees(case, after_turn),
         turn_scale_share=scale_error(images, after_turn),
         next_offset_m=errors.offset_m,
@@ -167,6 +206,26 @@ def rate_share(case: SceneCase, found: TargetMap) -> float:
     assert found.motion is not None
     true = np.array(case.omega_rad_s)
     return float(np.linalg.norm(found.motion.omega_rad_s - true) / np.linalg.norm(true))
+
+
+def size_and_direction(case: SceneCase, found: TargetMap) -> tuple[float, float]:
+    """Return the error of the size of the rate, as a share, and that of its direction, rad."""
+    assert found.motion is not None
+    true, mine = np.array(case.omega_rad_s), found.motion.omega_rad_s
+    size, length = float(np.linalg.norm(true)), float(np.linalg.norm(mine))
+    across = float(np.linalg.norm(np.cross(true, mine))) / (size * length)
+    return length / size - 1.0, math.asin(min(across, 1.0))
+
+
+def mounting_direction(images: UnknownImages) -> float:
+    """Return the angle, rad, by which the mean of the cameras' true mounting errors turns the
+    direction of the rate: no image tells it.
+    """
+    turns = []
+    for i, chaser in enumerate(images.scenario.chasers):
+        turns.append(rotations.rotate(chaser.q_wxyz, camera_errors(images.scenario, i).turn_rad))
+    true = np.array(images.case.omega_rad_s)
+    return float(np.linalg.norm(np.cross(np.mean(turns, axis=0), true)) / np.linalg.norm(true))
 
 
 def rate_nees(case: SceneCase, found: TargetMap) -> float:
@@ -276,28 +335,37 @@ _CHUNK = 50
 """Points whose distances from all triangles are computed at once: 20 MB."""
 
 
+def case_of(options: Options, seed: int) -> SceneCase:
+    """Return the sequence of a seed. Suns and rates take turns, so that as many seeds as there are
+    pairs fly each pair once.
+    """
+    suns, rates = options.suns, options.rates_deg_s
+    number = seed % (len(suns) * len(rates))
+    turn = number + number // math.lcm(len(suns), len(rates))
+    omega = np.array(TUMBLES[seed % len(TUMBLES)])
+    omega *= np.deg2rad(rates[turn % len(rates)]) / np.linalg.norm(omega)
+    x, y, z = omega.tolist()
+    sun = SUNS[suns[number % len(suns)]]
+    case = SceneCase(mesh=options.mesh, to_sun=sun, omega_rad_s=(x, y, z), seed=seed)
+    turns = 1.0 if options.quick else 2.0
+    return replace(case, duration_s=float(np.ceil(turns * case.turn_s)) + _AFTER_S)
+
+
+_AFTER_S = 8.0
+"""Time after the last whole turn, s: more than an update takes."""
+
+
 def measure(options: Options) -> Figures:
     """Measure map and motion of each seed."""
-    omega = np.array(SceneCase().omega_rad_s)
-    if options.rate_deg_s is not None:
-        omega *= np.deg2rad(options.rate_deg_s) / np.linalg.norm(omega)
-    x, y, z = omega.tolist()
-    sx, sy, sz = options.sun
-    case = SceneCase(mesh=options.mesh, to_sun=(sx, sy, sz), omega_rad_s=(x, y, z))
-    case = replace(
-        case, duration_s=float(np.ceil((1.0 if options.quick else 2.0) * case.turn_s)) + 8
-    )
-    key = {"mesh": case.mesh, "sun": list(case.to_sun), "omega": [round(v, 6) for v in (x, y, z)],
-           "duration_s": case.duration_s}  # fmt: skip
-    outcomes = KeptResults(options.results, key, MapOutcome).of(
-        seeds_of(options, 20, 1),
-        partial(_flown, case, options.images),
-        lambda o: (
-            f"first {o.first_s:.0f} s, rate {1e2 * o.turn_rate_share:.3f} %, next turn "
-            f"{1e3 * o.next_position_m:.2f} mm {np.rad2deg(o.next_angle_rad):.3f} deg"
-        ),
-        options.jobs,
-    )
+    outcomes = []
+    for seed in seeds_of(options, 20, 1):
+        case = case_of(options, seed)
+        key = {"mesh": case.mesh, "sun": list(case.to_sun),
+               "omega": [round(v, 6) for v in case.omega_rad_s],
+               "duration_s": case.duration_s}  # fmt: skip
+        outcomes += KeptResults(options.results, key, MapOutcome).of(
+            [seed], partial(_flown, case, options.images), _line
+        )
     rows = {name: np.array([getattr(o, name) for o in outcomes]) for name in _FIELDS}
     mapped = np.isfinite(rows["first_s"])
     figures: Figures = {
@@ -310,11 +378,81 @@ def measure(options: Options) -> Figures:
         if len(known):
             figures[f"{name}_median"] = float(np.median(np.abs(known)))
             figures[f"{name}_max"] = float(np.abs(known).max())
-    known = rows["turn_nees"][np.isfinite(rows["turn_nees"])]
-    if len(known):
-        figures["turn_nees_mean"] = float(known.mean())
+    for name in ("half_nees", "turn_nees", "closed_nees"):
+        known = rows[name][np.isfinite(rows[name])]
+        if len(known):
+            figures[f"{name}_mean"] = float(known.mean())
     return figures
 
+
+REFUSED_S = 30.0
+"""Duration of a sequence that must give no map: six times that of a usual start."""
+
+
+@dataclass(frozen=True)
+class RefusalOutcome:
+    """States of the mapper while it must not give a map with distances: the last one, whether any
+    was `mapped`, and the standard deviation of the scale, as a share, where a map has none.
+    """
+
+    status: str
+    mapped: bool
+    scale_share: float = math.nan
+
+
+def refused(case: SceneCase, folder: Path) -> RefusalOutcome:
+    """Return what the mapper says in a sequence."""
+    images = UnknownImages(case, folder)
+    camera, chasers = images.camera, len(case.places_m)
+    trackers = [FeatureTracker(camera) for _ in range(chasers)]
+    mapper = Mapper([uncertainty(images)] * chasers, camera.fx_px)
+    next_s, found, mapped = 1.0, TargetMap(0.0, "gathering"), False
+    for exposure in images.exposures():
+        i, at_s, own = exposure.chaser, exposure.time_s, exposure.odometry
+        lens, q = camera.irf_pose_in_world(own.position_m, own.q_wxyz)
+        seen = trackers[i].track(exposure.image, at_s, lens, q)
+        rays = camera.normalized(seen.px)
+        mapper.add(ImageTracks(i, at_s, lens, rotations.to_matrix(q), seen.ids, rays, seen.ages_s))
+        if i == chasers - 1 and at_s >= next_s:
+            found = mapper.update(at_s)
+            mapped |= found.status == "mapped"
+            next_s = at_s + (UPDATE_S if found.motion is not None else 1.0)
+    return RefusalOutcome(found.status, mapped, found.scale_share)
+
+
+def measure_refused(options: Options) -> Figures:
+    """Measure what gives no map: one chaser, whose scale is unknown, and a target that stands
+    still. Raises BenchmarkFailed if anything is `mapped`.
+    """
+    figures: Figures = {}
+    for name, expected in _REFUSALS.items():
+        outcomes = []
+        for seed in seeds_of(options, 20, 1):
+            case = replace(case_of(options, seed), duration_s=REFUSED_S)
+            if name == "single":
+                case = replace(case, places_m=case.places_m[:1])
+            else:
+                case = replace(case, omega_rad_s=(0.0, 0.0, 0.0))
+            key = {"refused": name, "mesh": case.mesh, "sun": list(case.to_sun),
+                   "omega": [round(v, 6) for v in case.omega_rad_s]}  # fmt: skip
+            outcomes += KeptResults(options.results, key, RefusalOutcome).of(
+                [seed],
+                lambda seed, case=case: refused(replace(case, seed=seed), options.images),
+                lambda o, name=name: f"{name}: {o.status}",
+            )
+        figures[f"{name}_sequences"] = len(outcomes)
+        figures[f"{name}_named"] = float(sum(o.status in expected for o in outcomes))
+        figures[f"{name}_mapped"] = float(sum(o.mapped for o in outcomes))
+    if any(v for k, v in figures.items() if k.endswith("_mapped")):
+        raise BenchmarkFailed("a map where there must be none", figures)
+    return figures
+
+
+_REFUSALS = {
+    "single": ("scale unknown", "ambiguous"),
+    "still": ("does not turn", "no texture"),
+}
+"""What the mapper may say at the end, by sequence. A tracker shows no point that does not move."""
 
 _FIELDS = tuple(MapOutcome.__dataclass_fields__)
 
@@ -323,13 +461,25 @@ def _flown(case: SceneCase, folder: Path, seed: int) -> MapOutcome:
     return fly(replace(case, seed=seed), folder)
 
 
+def _line(o: MapOutcome) -> str:
+    return (
+        f"first {o.first_s:.0f} s, rate {1e2 * o.turn_rate_share:.3f} %, NEES {o.turn_nees:.1f}, "
+        f"closed {o.closed_turns:.2f}: {1e2 * o.closed_rate_share:.3f} %, {o.closed_nees:.1f}, "
+        f"{1e3 * o.closed_position_m:.2f} mm {np.rad2deg(o.closed_angle_rad):.3f} deg; "
+        f"next turn {1e3 * o.next_position_m:.2f} mm {np.rad2deg(o.next_angle_rad):.3f} deg"
+    )
+
+
 def _add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--mesh", choices=satellite_names(), default="geo_servicer")
     parser.add_argument(
-        "--sun", nargs=3, type=float, metavar=("X", "Y", "Z"), default=SceneCase().to_sun,
-        help="direction to the sun, WRF",
+        "--suns", nargs="+", choices=tuple(SUNS), default=list(SUNS), metavar="NAME",
+        help=f"where the sun is, by turns (default: {' '.join(SUNS)})",
     )  # fmt: skip
-    parser.add_argument("--rate-deg-s", type=float, metavar="RATE", help="tumble (default: 3.2)")
+    parser.add_argument(
+        "--rates-deg-s", nargs="+", type=float, default=[3.2, 5.0], metavar="RATE",
+        help="how fast the target turns, by turns (default: 3.2 5)",
+    )  # fmt: skip
     parser.add_argument(
         "--images", type=Path, metavar="FOLDER", default=Path("/tmp/chaserdock-unknown"),
         help="keeps rendered images, 0.2 GB a sequence (default: /tmp/chaserdock-unknown)",
@@ -337,5 +487,8 @@ def _add_options(parser: ArgumentParser) -> None:
 
 
 GROUP = Group(
-    {"map": measure}, uses=("flights", "first", "jobs", "results"), add_options=_add_options
+    {"map": measure, "refused": measure_refused},
+    on_request=("refused",),
+    uses=("flights", "first", "results"),
+    add_options=_add_options,
 )

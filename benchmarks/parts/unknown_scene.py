@@ -29,6 +29,25 @@ TICKS_PER_IMAGE = 6
 """Ticks of odometry, at 30 Hz, from image to image: five images a second."""
 
 
+SUNS: dict[str, Vector3] = {
+    "behind": (-0.866, 0.25, 0.433),
+    "right": (-0.5, -0.8, 0.33),
+    "above": (-0.3, 0.3, 0.9),
+    "below": (-0.5, -0.3, -0.81),
+    "side": (0.3, -0.9, 0.3),
+}
+"""Directions to the sun, WRF, for chasers that look along X: 30 to 110 degrees off the first camera
+and 35 to 90 degrees off the second one."""
+TUMBLES: tuple[Vector3, ...] = (
+    (0.015, 0.045, 0.03),
+    (0.04, -0.02, 0.03),
+    (-0.03, 0.03, 0.035),
+    (0.03, 0.04, -0.025),
+    (-0.02, -0.045, 0.02),
+)
+"""Directions of the rate, TRF, in general position; a seed has one of them."""
+
+
 @dataclass(frozen=True)
 class SceneCase:
     """One sequence.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -14,22 +15,31 @@ from chaserdock_agents.mapper.types import ConstantRates, ImageTracks
 from chaserdock_models import rotations
 from unknown_cases import FOCAL_PX, LAB, NOISE_PX, TRUE, PointTarget
 
-WHITE = MapperTuning(noise_px=NOISE_PX)
+WHITE = MapperTuning(noise_px=NOISE_PX, open_factor=1.0)
 """For points whose errors are independent, unlike those of tracks in images."""
 FEW = StartTuning(directions=14, rates_rad_s=(0.05,), steps=10, pair_tracks=60)
 """Fewer starts, for time."""
+SLIDE_PX_S = 0.15
+"""Standard deviation of how fast points slide."""
 
 
 def mapped(target: PointTarget, until_s: float, tuning: MapperTuning = WHITE) -> list[TargetMap]:
     """Return the maps of updates every two seconds."""
-    mapper = Mapper([LAB] * target.chasers, FOCAL_PX, tuning, FEW)
+    return maps_of(target.images(until_s), target.chasers, tuning, 2.0)
+
+
+def maps_of(
+    images: Iterable[ImageTracks], chasers: int, tuning: MapperTuning, period_s: float
+) -> list[TargetMap]:
+    """Return the maps of updates every ``period_s``, from 4 s on."""
+    mapper = Mapper([LAB] * chasers, FOCAL_PX, tuning, FEW)
     out: list[TargetMap] = []
     next_s = 4.0
-    for image in target.images(until_s):
+    for image in images:
         mapper.add(image)
-        if image.chaser == target.chasers - 1 and image.time_s >= next_s - 1e-6:
+        if image.chaser == chasers - 1 and image.time_s >= next_s - 1e-6:
             out.append(mapper.update(image.time_s))
-            next_s += 2.0
+            next_s += period_s
     return out
 
 
@@ -53,6 +63,35 @@ def test_motion_is_recovered_with_a_consistent_covariance() -> None:
     # Of 6, less two fifths: points with large residuals count for less.
     assert 1.5 < np.mean(nees) < 9.0
     assert max(shares) < 0.01
+
+
+def sliding(target: PointTarget, until_s: float) -> list[ImageTracks]:
+    """Return images whose points slide while they are followed, each in its own direction."""
+    slides = np.random.default_rng(target.seed).normal(0.0, SLIDE_PX_S / FOCAL_PX, (10000, 2))
+    since: dict[tuple[int, int], float] = {}
+    out = []
+    for image in target.images(until_s):
+        begin = [since.setdefault((image.chaser, i), image.time_s) for i in image.ids.tolist()]
+        ages_s = image.time_s - np.array(begin)
+        rays = image.rays + slides[image.ids] * ages_s[:, None]
+        out.append(replace(image, rays=rays, ages_s=ages_s))
+    return out
+
+
+@pytest.mark.slow(0.2)
+def test_points_that_slide_leave_the_motion_consistent() -> None:
+    nees = []
+    for slide_px in (SLIDE_PX_S / float(np.linalg.norm(TRUE.omega_rad_s)), 1e-3):
+        tuning = replace(WHITE, slide_px=slide_px, slide_px_s=0.0)
+        found = []
+        for seed in range(2):
+            last = maps_of(sliding(PointTarget(seed), 16.2), 2, tuning, 4.0)[-1]
+            error = error_of(last)
+            found.append(float(error @ np.linalg.solve(last.covariance[3:, 3:], error)))
+        nees.append(np.mean(found))
+    # Of 6; the second mapper takes the points for fixed ones.
+    assert nees[0] < 12.0
+    assert nees[1] > 2.0 * nees[0]
 
 
 @pytest.mark.slow(0.1)

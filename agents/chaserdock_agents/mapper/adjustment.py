@@ -2,14 +2,17 @@
 """Adjust motion, cameras and landmarks to what cameras saw: bundle adjustment.
 
 Unknowns are the nine of the motion, nine of each chaser's camera, three of each view (noise of its
-attitude), and three of each landmark. Landmarks are eliminated (Schur complement); the others are
-few and solved densely. Levenberg-Marquardt with Cauchy weights.
+attitude), three of each landmark and two of each track: how fast its point slides. Landmarks and
+slides are eliminated (Schur complement); the others are few and solved densely.
+Levenberg-Marquardt with Cauchy weights.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from chaserdock_models import rotations
@@ -42,7 +45,7 @@ class AdjustmentTuning:
 class Problem:
     """What an adjustment starts from. ``focal_px``: of all cameras. ``prior``: of the motion; along
     its axis of rotation it says where the origin of TRF is. ``noise_px``: of a coordinate, for
-    independent observations.
+    independent observations. ``slide_px_s``: standard deviation of how fast a point slides.
     """
 
     views: CameraViews
@@ -51,6 +54,29 @@ class Problem:
     focal_px: float
     prior: ConstantRates
     noise_px: float
+    slide_px_s: float
+
+    @cached_property
+    def tracks(self) -> _Tracks:
+        """The tracks of the observations."""
+        seen = self.observations
+        keys, first, of = np.unique(seen.track, return_index=True, return_inverse=True)
+        return _Tracks(of, seen.landmark[first], seen.weight * seen.age_s, _summing(of, len(keys)))
+
+
+class _Tracks(NamedTuple):
+    """The q tracks of k observations: ``of`` (k,) each is, ``landmark`` (q,) of each. ``lever_s``
+    (k,): derivative of a weighted residual by the slide of its track. ``gather`` (q, k): sums.
+    """
+
+    of: IntArray
+    landmark: IntArray
+    lever_s: Array
+    gather: sparse.csr_matrix
+
+    def sums(self, values: Array) -> Array:
+        """Return the sums (q, ...) of values (k, ...) by track."""
+        return np.asarray(self.gather @ values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +122,20 @@ def right_jacobian(phi: Array) -> Array:
     return np.eye(3) - a * s + b * (s @ s)
 
 
-def in_cameras(
-    problem: Problem, estimate: MapEstimate, observations: Observations | None = None
-) -> Array:
-    """Return the landmarks of observations (k, 3) in IRF."""
-    seen = problem.observations if observations is None else observations
-    views, motion = problem.views, estimate.motion
-    position, turned = motion.at(views.time_s)
+class _Geometry(NamedTuple):
+    """Landmarks as views see them: rotations (m, 3, 3) TRF to WRF, IRF by odometry to the true IRF,
+    and WRF to the true IRF; landmarks of observations (k, 3) in IRF.
+    """
+
+    turned: Array
+    to_camera: Array
+    from_w: Array
+    points: Array
+
+
+def _geometry(problem: Problem, estimate: MapEstimate) -> _Geometry:
+    seen, views = problem.observations, problem.views
+    position, turned = estimate.motion.at(views.time_s)
     error = estimate.cameras[views.chaser]
     to_camera = rotations.to_matrix(rotations.exp(-(error[:, :3] + estimate.turns)))
     # y = Q (p + R X - c) - T s, with Q from WRF and T from IRF by odometry to the true IRF.
@@ -111,21 +144,45 @@ def in_cameras(
     offset -= np.einsum("mij,mj->mi", to_camera, error[:, 3:6])
     matrix = from_w @ turned
     points = estimate.landmarks_m[seen.landmark]
-    return (matrix[seen.view] @ points[:, :, None])[:, :, 0] + offset[seen.view]
+    points = (matrix[seen.view] @ points[:, :, None])[:, :, 0] + offset[seen.view]
+    return _Geometry(turned, to_camera, from_w, points)
 
 
-def residuals(problem: Problem, estimate: MapEstimate) -> Array:
-    """Return weighted residuals (k, 2), px; large ones for landmarks behind a camera."""
-    y = in_cameras(problem, estimate)
-    return _residuals(problem, estimate, y)
+class MapFit(NamedTuple):
+    """How observations fit an estimate whose slides are those of least cost: the estimate, weighted
+    residuals (k, 2), px, which are large for landmarks behind a camera, and depths (k,), m.
+    """
+
+    estimate: MapEstimate
+    residual: Array
+    depth_m: Array
+
+
+def fit(problem: Problem, estimate: MapEstimate, robust_px: float) -> MapFit:
+    """Return how observations fit motion, cameras, turns and landmarks of an estimate."""
+    y, tracks = _geometry(problem, estimate).points, problem.tracks
+    slides = np.zeros((len(tracks.landmark), 2))
+    still = _residuals(problem, replace(estimate, slides_px_s=slides), y)
+    residual = still
+    for _ in range(_SLIDE_ROUNDS):
+        weight = _weights(residual, robust_px) / problem.noise_px**2
+        stiff = tracks.sums(weight * tracks.lever_s**2) + _slide_information(problem, slides)
+        slides = -tracks.sums((weight * tracks.lever_s)[:, None] * still) / stiff[:, None]
+        residual = still + tracks.lever_s[:, None] * slides[tracks.of]
+    return MapFit(replace(estimate, slides_px_s=slides), residual, y[:, 2])
+
+
+_SLIDE_ROUNDS = 3
+"""Repetitions until the slides of tracks and the weights of their observations agree."""
 
 
 def _residuals(problem: Problem, estimate: MapEstimate, y: Array) -> Array:
     depth = np.maximum(y[:, 2:], _LEAST_DEPTH_M)
-    seen = problem.observations
+    seen, tracks = problem.observations, problem.tracks
     error = estimate.cameras[problem.views.chaser[seen.view]]
     off = problem.focal_px * ((1.0 + error[:, 6:7]) * y[:, :2] / depth - seen.rays)
-    return seen.weight[:, None] * (off + error[:, 7:9] * seen.age_s[:, None])
+    slide = error[:, 7:9] + estimate.slides_px_s[tracks.of]
+    return seen.weight[:, None] * off + tracks.lever_s[:, None] * slide
 
 
 _LEAST_DEPTH_M = 0.02
@@ -134,14 +191,10 @@ _LEAST_DEPTH_M = 0.02
 
 def _linearize(problem: Problem, estimate: MapEstimate) -> _Linearized:
     views, seen, motion = problem.views, problem.observations, estimate.motion
-    _, turned = motion.at(views.time_s)
-    error = estimate.cameras[views.chaser]
-    to_camera = rotations.to_matrix(rotations.exp(-(error[:, :3] + estimate.turns)))
-    from_w = to_camera @ views.rotation.transpose(0, 2, 1)
+    turned, to_camera, from_w, y = _geometry(problem, estimate)
     after = views.time_s - motion.time_s
-    y = in_cameras(problem, estimate)
     depth = np.maximum(y[:, 2], _LEAST_DEPTH_M)
-    focal = problem.focal_px * (1.0 + error[seen.view, 6])
+    focal = problem.focal_px * (1.0 + estimate.cameras[views.chaser[seen.view], 6])
     by_y = np.zeros((len(y), 2, 3))
     by_y[:, 0, 0] = by_y[:, 1, 1] = focal / depth
     by_y[:, :, 2] = -(focal / depth**2)[:, None] * y[:, :2]
@@ -159,21 +212,26 @@ def _linearize(problem: Problem, estimate: MapEstimate) -> _Linearized:
     out[:, :, 9:12] = out[:, :, 18:21] = by_turn
     out[:, :, 12:15] = -by_y @ to_camera[seen.view]
     out[:, :, 15] = problem.focal_px * y[:, :2] * (seen.weight / depth)[:, None]
-    out[:, :, 16:18] = np.eye(2) * (seen.weight * seen.age_s)[:, None, None]
+    out[:, :, 16:18] = np.eye(2) * problem.tracks.lever_s[:, None, None]
     return _Linearized(_residuals(problem, estimate, y), out, by_landmark)
 
 
 class _Normal:
-    """Normal equations: of motion, cameras and views, with landmarks eliminated."""
+    """Normal equations: of motion, cameras and views, with landmarks and slides eliminated.
+
+    ``u`` (a, a) and ``g`` (a,): of what is not eliminated. ``v`` (n, 3, 3), ``h`` (n, 3) and ``w``
+    (n, 3, a): of landmarks. Those of slides, divided by the root of their information: ``c``
+    (q, 2, a), ``e`` (q, 2, 3) with the track's landmark, ``s`` (q, 2); ``root`` (q,).
+    """
 
     def __init__(self, problem: Problem, estimate: MapEstimate, weights: Array) -> None:
         lin, seen, views = _linearize(problem, estimate), problem.observations, problem.views
+        tracks = problem.tracks
         count, landmarks = len(views.time_s), len(estimate.landmarks_m)
         chasers = len(problem.cameras)
         first_turn = MOTION + CAMERA * chasers
         size = first_turn + TURN * count
-        weight = weights / problem.noise_px**2
-        root = np.sqrt(weight)[:, None]
+        root = np.sqrt(weights)[:, None] / problem.noise_px
         a, b = lin.by_view * root[:, :, None], lin.by_landmark * root[:, :, None]
         r = lin.residual * root
         u, g = np.zeros((size, size)), np.zeros(size)
@@ -184,19 +242,28 @@ class _Normal:
             at = self._places(views.chaser[view], view, first_turn)
             u[np.ix_(at, at)] += block.T @ block
             g[at] += block.T @ r[rows].ravel()
+        self._chaser, self._turns = views.chaser[seen.view], first_turn + TURN * seen.view
+        self._shape = (chasers, size)
         gather = _by_landmark(seen, landmarks)
-        cross = a.transpose(0, 2, 1) @ b
-        w = np.zeros((size, landmarks, 3))
-        w[:MOTION] = _gathered(gather, cross[:, :MOTION]).transpose(1, 0, 2)
-        for chaser in range(chasers):
-            own = (views.chaser[seen.view] == chaser)[:, None, None]
-            at = MOTION + CAMERA * chaser
-            part = cross[:, MOTION : MOTION + CAMERA] * own
-            w[at : at + CAMERA] = _gathered(gather, part).transpose(1, 0, 2)
-        turn_rows = first_turn + TURN * seen.view[:, None] + np.arange(TURN)
-        w[turn_rows, seen.landmark[:, None]] = cross[:, MOTION + CAMERA :]
         self.v = _gathered(gather, b.transpose(0, 2, 1) @ b)
         self.h = _gathered(gather, b.transpose(0, 2, 1) @ r[:, :, None])[:, :, 0]
+        self.w = self._crossed(gather, b.transpose(0, 2, 1) @ a, seen.landmark)
+        lever = tracks.lever_s * root[:, 0]
+        information = tracks.sums(lever**2) + _slide_information(problem, estimate.slides_px_s)
+        self.root = np.sqrt(information)
+        share = lever / self.root[tracks.of]
+        self.c = self._crossed(tracks.gather, share[:, None, None] * a, tracks.of)
+        self.e = _gathered(tracks.gather, share[:, None, None] * b)
+        prior = _slide_information(problem, estimate.slides_px_s)[:, None] * estimate.slides_px_s
+        self.s = tracks.sums(share[:, None] * r) + prior / self.root[:, None]
+        self.landmark = tracks.landmark
+        joined = _summing(tracks.landmark, landmarks)
+        back = self.e.transpose(0, 2, 1)
+        self.v -= _gathered(joined, back @ self.e)
+        self.h -= _gathered(joined, back @ self.s[:, :, None])[:, :, 0]
+        self.w -= _gathered(joined, back @ self.c)
+        flat = self.c.reshape(-1, size)
+        g -= self.s.ravel() @ flat
         sigma = _prior_sigmas(problem)
         off = _off_prior(problem, estimate)
         u[np.diag_indices(size)] += 1.0 / sigma**2
@@ -204,7 +271,24 @@ class _Normal:
         axis = _gauge(problem)
         u[:3, :3] += np.outer(axis, axis)
         g[:3] += axis * (axis @ off[:3])
-        self.u, self.g, self.w = u, g, w
+        self.u, self.g = u - flat.T @ flat, g
+
+    def _crossed(self, gather: sparse.csr_matrix, cross: Array, group: IntArray) -> Array:
+        """Return products (n, j, a) with all unknowns, by group, of products (k, j, 21) of
+        observations with theirs.
+        """
+        chasers, size = self._shape
+        by_motion = _gathered(gather, cross[:, :, :MOTION])
+        out = np.zeros((*by_motion.shape[:2], size))
+        out[:, :, :MOTION] = by_motion
+        for chaser in range(chasers):
+            own = (self._chaser == chaser)[:, None, None]
+            at = MOTION + CAMERA * chaser
+            part = cross[:, :, MOTION : MOTION + CAMERA] * own
+            out[:, :, at : at + CAMERA] = _gathered(gather, part)
+        rows = self._turns[:, None] + np.arange(TURN)
+        out[group[:, None], :, rows] = cross[:, :, MOTION + CAMERA :].transpose(0, 2, 1)
+        return out
 
     @staticmethod
     def _places(chaser: int, view: int, first_turn: int) -> IntArray:
@@ -221,19 +305,21 @@ class _Normal:
         v = self.v + np.eye(3) * _FLOOR
         v = v + np.eye(3) * (damping * np.einsum("nii->ni", v)[:, None, :])
         lower = np.linalg.inv(np.linalg.cholesky(v))
-        whitened = self.w.transpose(1, 0, 2) @ lower.transpose(0, 2, 1)
-        whitened = whitened.transpose(1, 0, 2).reshape(len(self.u), -1)
+        whitened = (lower @ self.w).reshape(-1, len(self.u))
         inverse = lower.transpose(0, 2, 1) @ lower
-        s = self.u + np.diag(damping * np.diag(self.u)) - whitened @ whitened.T
-        rhs = self.g - whitened @ np.einsum("nij,nj->ni", lower, self.h).ravel()
+        s = self.u + np.diag(damping * np.diag(self.u)) - whitened.T @ whitened
+        rhs = self.g - np.einsum("nij,nj->ni", lower, self.h).ravel() @ whitened
         return s, rhs, inverse
 
-    def step(self, damping: float) -> tuple[Array, Array]:
-        """Return the step of motion, cameras and views (a,), and that of the landmarks (n, 3)."""
+    def step(self, damping: float) -> tuple[Array, Array, Array]:
+        """Return the steps of motion, cameras and views (a,), of the landmarks (n, 3), and of the
+        slides (q, 2).
+        """
         s, rhs, inverse = self.reduced(damping)
         first = -cho_solve(cho_factor(s, lower=True), rhs)
-        rest = self.h + (first @ self.w.reshape(len(first), -1)).reshape(-1, 3)
-        return first, -np.einsum("nij,nj->ni", inverse, rest)
+        points = -np.einsum("nij,nj->ni", inverse, self.h + self.w @ first)
+        of_points = np.einsum("qij,qj->qi", self.e, points[self.landmark])
+        return first, points, -(self.s + self.c @ first + of_points) / self.root[:, None]
 
 
 _FLOOR = 1e-3
@@ -242,8 +328,13 @@ _FLOOR = 1e-3
 
 def _by_landmark(seen: Observations, count: int) -> sparse.csr_matrix:
     """Return the matrix (n, k) that sums what observations have by landmark."""
-    every = np.arange(len(seen.view))
-    return sparse.csr_matrix((np.ones(len(every)), (seen.landmark, every)), (count, len(every)))
+    return _summing(seen.landmark, count)
+
+
+def _summing(group: IntArray, count: int) -> sparse.csr_matrix:
+    """Return the matrix (n, k) that sums values (k, ...) by their groups (k,)."""
+    every = np.arange(len(group))
+    return sparse.csr_matrix((np.ones(len(every)), (group, every)), (count, len(every)))
 
 
 def _gathered(gather: sparse.csr_matrix, values: Array) -> Array:
@@ -260,8 +351,9 @@ def _off_prior(problem: Problem, estimate: MapEstimate) -> Array:
 
 def _prior_sigmas(problem: Problem) -> Array:
     motion = np.repeat([_POSITION_PRIOR_M, _VELOCITY_PRIOR_M_S, _RATE_PRIOR_RAD_S], 3)
+    mean_px_s = _MEAN_SLIDE * problem.slide_px_s
     cameras = [
-        np.array([*[c.turn_rad] * 3, *[c.shift_m] * 3, c.focal_share, *[_SLIDE_PX_S] * 2])
+        np.array([*[c.turn_rad] * 3, *[c.shift_m] * 3, c.focal_share, *[mean_px_s] * 2])
         for c in problem.cameras
     ]
     noise = np.array([view_turn_sigma_rad(c) for c in problem.cameras])
@@ -288,8 +380,9 @@ def view_turn_sigma_rad(camera: CameraUncertainty) -> float:
     return float(np.hypot(camera.attitude_noise_rad, camera.position_noise_m / _USUAL_RANGE_M))
 
 
-_SLIDE_PX_S = 0.1
-"""Standard deviation of the mean slide of a camera's points: shading follows the light."""
+_MEAN_SLIDE = 0.6
+"""Standard deviation of the mean slide of a camera's points, share of that of one point: shading
+follows the light."""
 _POSITION_PRIOR_M = 0.5
 """Standard deviation of the first guess of the target's position: the cameras' lines of sight to
 the middle of the moving points."""
@@ -303,7 +396,9 @@ _USUAL_RANGE_M = 1.8
 """Range of an inspection: 0.5 mm are 0.016 degrees there."""
 
 
-def _moved(estimate: MapEstimate, problem: Problem, first: Array, landmarks: Array) -> MapEstimate:
+def _moved(
+    estimate: MapEstimate, problem: Problem, first: Array, landmarks: Array, slides: Array
+) -> MapEstimate:
     chasers = len(problem.cameras)
     end = MOTION + CAMERA * chasers
     return MapEstimate(
@@ -311,7 +406,24 @@ def _moved(estimate: MapEstimate, problem: Problem, first: Array, landmarks: Arr
         estimate.cameras + first[MOTION:end].reshape(chasers, CAMERA),
         estimate.turns + first[end:].reshape(-1, TURN),
         estimate.landmarks_m + landmarks,
+        estimate.slides_px_s + slides,
     )
+
+
+def _weights(residual: Array, robust_px: float) -> Array:
+    """Return the weights (k,) of residuals (k, 2) that follow from `robust_cost`."""
+    return 1.0 / (1.0 + (residual**2).sum(axis=1) / robust_px**2)
+
+
+def _slide_information(problem: Problem, slides_px_s: Array) -> Array:
+    """Return the weights (q,), s^2/px^2, of the priors of slides (q, 2): Student's distribution."""
+    sigma, freedom = problem.slide_px_s, _SLIDE_FREEDOM
+    share = (slides_px_s**2).sum(axis=1) / sigma**2
+    return (freedom + 2.0) / (freedom + share) / sigma**2
+
+
+_SLIDE_FREEDOM = 3.0
+"""Degrees of freedom of the distribution of slides: most points hardly slide, some much."""
 
 
 def robust_cost(residual: Array, robust_px: float) -> Array:
@@ -320,7 +432,11 @@ def robust_cost(residual: Array, robust_px: float) -> Array:
 
 
 def _total(problem: Problem, estimate: MapEstimate, robust_px: float) -> float:
-    seen = robust_cost(residuals(problem, estimate), robust_px).sum() / problem.noise_px**2
+    residual = _residuals(problem, estimate, _geometry(problem, estimate).points)
+    seen = robust_cost(residual, robust_px).sum() / problem.noise_px**2
+    freedom, sigma = _SLIDE_FREEDOM, problem.slide_px_s
+    share = (estimate.slides_px_s**2).sum(axis=1) / (freedom * sigma**2)
+    seen += (freedom + 2.0) * np.log1p(share).sum()
     off = _off_prior(problem, estimate)
     prior = ((off / _prior_sigmas(problem)) ** 2).sum() + (_gauge(problem) @ off[:3]) ** 2
     return float(seen + prior)
@@ -331,13 +447,16 @@ def adjust(
 ) -> Adjusted | None:
     """Return the estimate of least robust cost near ``start``; None if it is not determined."""
     tuning = tuning or AdjustmentTuning()
-    estimate, damping, converged = start, tuning.damping, False
+    estimate, damping, converged = (
+        fit(problem, start, tuning.robust_px).estimate,
+        tuning.damping,
+        False,
+    )
     cost = _total(problem, estimate, tuning.robust_px)
     try:
         for _ in range(tuning.steps):
-            residual = residuals(problem, estimate)
-            weights = 1.0 / (1.0 + (residual**2).sum(axis=1) / tuning.robust_px**2)
-            normal = _Normal(problem, estimate, weights)
+            residual = _residuals(problem, estimate, _geometry(problem, estimate).points)
+            normal = _Normal(problem, estimate, _weights(residual, tuning.robust_px))
             for _ in range(_TRIES):
                 candidate = _moved(estimate, problem, *normal.step(damping))
                 reached = _total(problem, candidate, tuning.robust_px)
@@ -364,10 +483,8 @@ _TRIES = 6
 def _described(
     problem: Problem, estimate: MapEstimate, tuning: AdjustmentTuning, converged: bool
 ) -> Adjusted:
-    residual = residuals(problem, estimate)
-    squared = (residual**2).sum(axis=1)
-    weights = 1.0 / (1.0 + squared / tuning.robust_px**2)
-    normal = _Normal(problem, estimate, weights)
+    residual = _residuals(problem, estimate, _geometry(problem, estimate).points)
+    normal = _Normal(problem, estimate, _weights(residual, tuning.robust_px))
     s, _, inverse = normal.reduced(0.0)
     count = len(s)
     factor = cho_factor(s, lower=True)
@@ -375,17 +492,17 @@ def _described(
     few = MOTION + CAMERA * len(problem.cameras)
     n = len(estimate.landmarks_m)
     # A landmark follows the other unknowns by -by_first'.
-    by_first = (normal.w.transpose(1, 0, 2) @ inverse).transpose(1, 0, 2)
+    by_first = inverse @ normal.w
     # Turns of the views are left out of the landmarks' covariances: they average out.
-    by_few = by_first[:few].transpose(1, 2, 0)
+    by_few = by_first[:, :, :few]
     landmark = inverse + by_few @ covariance[:few, :few] @ by_few.transpose(0, 2, 1)
     # The centre of the landmarks, p + mean X, at the motion's time.
-    by_centre = -by_first.mean(axis=1)
+    by_centre = -by_first.mean(axis=0).T
     by_centre[:3] += np.eye(3)
     centre = by_centre.T @ covariance @ by_centre + inverse.sum(axis=0) / n**2
     return Adjusted(
         estimate,
-        np.sqrt(squared),
+        np.linalg.norm(residual, axis=1),
         covariance[:few, :few],
         landmark,
         estimate.motion.position_w_m + estimate.landmarks_m.mean(axis=0),

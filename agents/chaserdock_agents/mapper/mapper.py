@@ -21,8 +21,7 @@ from .adjustment import (
     AdjustmentTuning,
     Problem,
     adjust,
-    in_cameras,
-    residuals,
+    fit,
     triangulate,
     with_landmarks,
 )
@@ -62,14 +61,22 @@ class MapperTuning:
     """Landmarks whose median residual is larger slide along edges or shadows."""
     first_residual_px: float = 4.0
     """The same before a start is adjusted."""
+    slide_px: float = 3.0
+    """Standard deviation of the slide of a point, px for a turn of 1 rad: 1 to 4 between 3 and 15 s
+    after it was found (docs/evidence/unknown.md)."""
     fresh_px: float = 0.3
-    slide_px_s: float = 0.05
-    """Standard deviation of a point at first, and its slide: 0.1 px/s on the grid of solar cells,
-    0.3 px/s on foil, whose shading follows the light (docs/evidence/unknown.md). Smaller than
-    both, as old points also tell what new ones do not."""
+    slide_px_s: float = 0.02
+    """Standard deviation of a point at first, and of what it strays beside a constant slide: 0.15
+    to 0.3 px in 8 s and more (docs/evidence/unknown.md)."""
     noise_px: float = 1.2
     """Noise of a coordinate as if views were independent. Points stray by 0.25 px, but alike in
     some ten views in a row, and neighbours together (NEES: docs/evidence/unknown.md)."""
+    open_factor: float = 2.5
+    """Factor of the motion's standard deviations until a side of the target has returned: slides of
+    points that are alike look like motion (NEES: docs/evidence/unknown.md)."""
+    closing_tracks: int = 100
+    """Tracks that must be found again before a side has returned: a third of those in an image.
+    With 30, when the first recalls arrive, the motion is not corrected yet (NEES 22)."""
     start_s: float = 4.0
     """Shortest span of views from which a start is tried."""
     least_points: int = 40
@@ -98,7 +105,8 @@ class TargetMap:
     ``motion`` and what follows are None, empty or infinite without a map. ``covariance`` (9, 9): of
     the motion's vector. ``cameras`` (chasers, 9): see `MapEstimate`. ``keys`` (n,): of landmarks,
     ``landmarks_m`` (n, 3), TRF, ``covariances_m2`` (n, 3, 3). ``scale_share``: standard deviation
-    of all distances.
+    of all distances. ``closed``: whether a side of the target was seen again after a turn; before,
+    the size of the rate is some tenths of a percent wrong.
     """
 
     time_s: float
@@ -112,6 +120,7 @@ class TargetMap:
     scale_share: float = float("inf")
     residual_px: float = float("inf")
     merges: int = 0
+    closed: bool = False
 
 
 class Mapper:
@@ -262,9 +271,7 @@ class Mapper:
         keys and prior; None if it explains nothing.
         """
         views, observations, keys = self._gathered(windows)
-        problem = Problem(
-            views, observations, self._cameras, self._focal_px, prior, self.tuning.noise_px
-        )
+        problem = self._problem(views, observations, prior, motion)
         estimate = MapEstimate(
             motion, np.zeros((len(self._cameras), CAMERA)), np.zeros((len(views.time_s), 3)),
             np.zeros((0, 3)),
@@ -292,10 +299,8 @@ class Mapper:
         assert self._last is not None
         assert self._prior is not None
         views, observations, keys = self.observations()
-        problem = Problem(
-            views, observations, self._cameras, self._focal_px, self._prior, self.tuning.noise_px
-        )
         last = self._last.estimate
+        problem = self._problem(views, observations, self._prior, last.motion)
         seen_at = list(zip(views.chaser.tolist(), views.time_s.tolist(), strict=True))
         turns = np.array([self._turns.get(at, np.zeros(3)) for at in seen_at])
         start = MapEstimate(last.motion, last.cameras, turns, last.landmarks_m)
@@ -317,22 +322,46 @@ class Mapper:
         self.merges.check(part.observations, adjusted.residual_px, chosen)
         self.merges.find(part.observations, adjusted, chosen)
         self.merges.forget(np.unique(observations.track))
-        return self._described(time_s, adjusted, chosen)
+        closed = self._closed(part, adjusted.estimate.motion)
+        return self._described(time_s, adjusted, chosen, closed)
 
-    def _described(self, time_s: float, found: Adjusted, keys: IntArray) -> TargetMap:
+    def _closed(self, problem: Problem, motion: ConstantRates) -> bool:
+        """Return whether enough tracks were found again after a part of a turn without them."""
+        of, seen_s = problem.tracks.of, problem.views.time_s[problem.observations.view]
+        order = np.lexsort((seen_s, of))
+        turned = np.diff(seen_s[order]) * float(np.linalg.norm(motion.omega_rad_s))
+        again = (np.diff(of[order]) == 0) & (turned > _UNSEEN_RAD)
+        return len(np.unique(of[order][1:][again])) >= self.tuning.closing_tracks
+
+    def _described(self, time_s: float, found: Adjusted, keys: IntArray, closed: bool) -> TargetMap:
         estimate = found.estimate
+        factor = 1.0 if closed else self.tuning.open_factor
         away = [v[-1].position_w_m for v in self._views if v]
         line = found.centre_m - away[0] if away else found.centre_m
         range_m = float(np.linalg.norm(line))
         scale = float(np.sqrt(line @ found.centre_covariance_m2 @ line)) / range_m**2
         status: MapStatus = "mapped" if scale < self.tuning.scale_share else "scale unknown"
         return TargetMap(
-            time_s, status, estimate.motion, found.covariance[:9, :9], estimate.cameras, keys,
-            estimate.landmarks_m, found.landmark_covariances_m2, scale,
-            float(np.median(found.residual_px)), self.merges.count,
+            time_s, status, estimate.motion, factor**2 * found.covariance[:9, :9],
+            estimate.cameras, keys, estimate.landmarks_m, found.landmark_covariances_m2, scale,
+            float(np.median(found.residual_px)), self.merges.count, closed,
         )  # fmt: skip
 
     # -- Gathering ---------------------------------------------------------------------------------
+
+    def _problem(
+        self,
+        views: CameraViews,
+        observations: Observations,
+        prior: ConstantRates,
+        motion: ConstantRates,
+    ) -> Problem:
+        """Return the adjustment of observations to a target about as fast as ``motion``."""
+        slide_px_s = self.tuning.slide_px * float(np.linalg.norm(motion.omega_rad_s))
+        return Problem(
+            views, observations, self._cameras, self._focal_px, prior, self.tuning.noise_px,
+            max(slide_px_s, _LEAST_SLIDE_PX_S),
+        )  # fmt: skip
 
     def _gathered(
         self, windows: Sequence[Sequence[ImageTracks]]
@@ -402,6 +431,11 @@ class Mapper:
         return replace(problem, observations=part), with_landmarks(start, points[good]), keys[good]
 
 
+_LEAST_SLIDE_PX_S = 1e-3
+"""Slide of points on a target that hardly turns."""
+_UNSEEN_RAD = 2.0
+"""Turn without a point after which it has returned: a side is out of view for more than half a
+turn."""
 _SLACK_S = 1e-6
 """Difference of two times, s, that are the same but for rounding."""
 _ASSUMED_M = 2.0
@@ -418,8 +452,9 @@ _MOST_TRACKS = 4000
 
 def _off_px(problem: Problem, estimate: MapEstimate) -> Array:
     """Return by how much each observation (k,) is off its landmark; the cap for one behind."""
-    off = np.linalg.norm(residuals(problem, estimate), axis=1)
-    off[in_cameras(problem, estimate)[:, 2] < _BEHIND_M] = _CAP_PX
+    found = fit(problem, estimate, AdjustmentTuning().robust_px)
+    off = np.linalg.norm(found.residual, axis=1)
+    off[found.depth_m < _BEHIND_M] = _CAP_PX
     return off
 
 

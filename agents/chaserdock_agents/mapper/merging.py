@@ -26,18 +26,18 @@ Descriptions = dict[int, list[tuple[float, Array]]]
 class MergingTuning:
     """Numbers of merging, with units and reasons."""
 
-    distance_m: float = 0.02
-    """Largest distance of landmarks that may be one: three standard deviations of those seen in
-    half a turn."""
+    distance_m: float = 0.012
+    """Largest distance of landmarks that may be one. Wrong merges turn the axis of rotation, fewer
+    ones leave the scale less certain (docs/evidence/unknown.md)."""
     unlike: float = 0.5
-    """Largest distance of unit descriptions: one in fifty pairs of different points is as alike,
-    and of these one in a thousand is within ``distance_m``."""
+    """Largest distance of unit descriptions: one in fifty pairs of different points is as alike."""
     kept: int = 6
     apart_s: float = 5.0
     """Descriptions kept of a track, the latest, and the time between them, 16 degrees of turn: a
     point looks different from other sides."""
-    residual_px: float = 1.5
-    """Median residual of a part of a merged landmark above which the merge is undone."""
+    residual_px: float = 0.6
+    """Median residual of a part of a merged landmark above which the merge is undone: three times
+    that of a single track; 1.4 mm at 2 m."""
 
 
 class Merges:

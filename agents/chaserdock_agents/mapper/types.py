@@ -7,7 +7,7 @@ lies on the axis of rotation; where along the axis is a convention.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -121,10 +121,12 @@ class MapEstimate:
 
     ``cameras`` (chasers, 9): turn (3,) and shift (3,) in IRF, share of the focal length, against
     the calibration, and mean slide (2,) of the points that it follows, px/s. ``turns`` (m, 3): of
-    each view against odometry, IRF. ``landmarks_m`` (n, 3), TRF.
+    each view against odometry, IRF. ``landmarks_m`` (n, 3), TRF. ``slides_px_s`` (q, 2): of the
+    tracks of an adjustment, in the order of their keys, beside the mean slide.
     """
 
     motion: ConstantRates
     cameras: Array
     turns: Array
     landmarks_m: Array
+    slides_px_s: Array = field(default_factory=lambda: np.zeros((0, 2)))

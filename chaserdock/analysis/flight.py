@@ -57,7 +57,7 @@ from numpy.typing import NDArray
 
 from .actuation import ImpulseTotals, OutputSource, commanded_output, true_output
 from .columns import Columns
-from .mapping import MapFit
+from .mapping import FittedFrame
 from .mass_properties import values_of
 from .motion import TARGET, KnownMotion, MotionCollector, Track, motion_columns
 from .pose_errors import POSE
@@ -373,14 +373,14 @@ class RecordedFlight:
         return lines
 
     @cached_property
-    def map_fit(self) -> MapFit | None:
+    def map_fit(self) -> FittedFrame | None:
         """Frame of the map on the target; None unless the target is mapped and its motion known."""
         if not self.scenario.maps_target or TARGET not in self.motion:
             return None
         late = self.estimate.time_s >= self.scenario.settling_s
         known = np.flatnonzero(self.estimate_known & late)
         rows, true = self.motion.at(TARGET, self.estimate.time_s[known])
-        return MapFit.of(self.estimate.rows(known[rows]), true) if len(rows) else None
+        return FittedFrame.of(self.estimate.rows(known[rows]), true) if len(rows) else None
 
     def estimated_frame(self, target: Track) -> Track:
         """Return the motion of the frame in which the flight software estimates the target: that

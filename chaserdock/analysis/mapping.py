@@ -24,7 +24,7 @@ from .motion import Track
 
 
 @dataclass(frozen=True, eq=False)
-class MapFit:
+class FittedFrame:
     """Frame of a map on the target: ``q_wxyz`` (4,) takes it to the target's own frame, in which
     ``origin_m`` (3,) is its origin.
     """
@@ -33,7 +33,7 @@ class MapFit:
     origin_m: Array
 
     @classmethod
-    def of(cls, estimate: Track, true: Track) -> MapFit:
+    def of(cls, estimate: Track, true: Track) -> FittedFrame:
         """Return the fit of estimated poses to true ones at the same times (K,), at least one."""
         turns = rotations.multiply(rotations.conjugate(true.q_wxyz), estimate.q_wxyz)
         mean = rotations.normalize(turns[0])

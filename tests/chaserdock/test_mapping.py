@@ -16,7 +16,7 @@ from message_samples import BY_TYPE
 from source_tree import ROOT
 
 from chaserdock.analysis.mapping import (
-    MapFit,
+    FittedFrame,
     mapping_criteria,
     mapping_of,
     mapping_text,
@@ -42,13 +42,13 @@ def turning() -> Track:
 
 
 def in_frame(true: Track, q: Array, origin: Array) -> Track:
-    return MapFit(q, origin).frame_of(true)
+    return FittedFrame(q, origin).frame_of(true)
 
 
 def test_the_frame_of_a_map_is_found_in_the_flight() -> None:
     true, q, origin = turning(), rotations.exp([1.1, 0.6, -0.9]), np.array([0.05, -0.12, 0.2])
     estimate = in_frame(true, q, origin)
-    fit = MapFit.of(estimate, true)
+    fit = FittedFrame.of(estimate, true)
     assert rotations.angle_between(fit.q_wxyz, q) < 1e-9
     assert np.allclose(fit.origin_m, origin)
     again = fit.frame_of(true)

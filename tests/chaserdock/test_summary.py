@@ -39,6 +39,7 @@ MAPS_ONLY = {"mapping"}
 IN_SOME_FLIGHTS = {
     "capture",
     "passive_safety",
+    "assurance",
     "rendezvous",
     "estimated_tracking",
     "sightings",

@@ -92,8 +92,8 @@ def test_log_contains_every_topic_at_its_rate(short_flight: Path) -> None:
             assert 1 <= count <= 8, key
     recorded = {id(found[0]) for key in counts if (found := topic_of_key(key)) is not None}
     missing = {topic.key for topic in TOPICS if id(topic) not in recorded}
-    # No operator commands, thrusters, docking ports, standby, plumes or passive safety in this
-    # flight.
+    # No operator commands, thrusters, docking ports, standby, plumes, passive safety or assurance
+    # in this flight.
     ports = (topics.DOCKING, topics.TRUTH_LOAD, topics.STACK)
     absent = (
         topics.COMMAND,
@@ -103,6 +103,8 @@ def test_log_contains_every_topic_at_its_rate(short_flight: Path) -> None:
         topics.STATE,
         topics.TRUTH_PLUME,
         topics.SAFETY,
+        topics.ASSURANCE,
+        *(topics.FEATURES, topics.MAP),  # of an unknown target
         *(topics.KILL, topics.BODY_REFERENCE),  # of a laboratory
     )
     assert missing == {t.key for t in absent}

@@ -283,10 +283,10 @@ class ControllerProcess:
         if self.standby.others:
             # State before wrenches: once a tick is answered, the standby must know the commands
             # that were processed with it.
+            wrenches = out.wrenches if self.realtime else {}
             commanded = tuple(
                 CommandedWrench(chaser=i, force_N=w.force_N, torque_N_m=w.torque_N_m)
-                for i, w in out.wrenches.items()
-                if self.realtime
+                for i, w in wrenches.items()
             )
             self._publish_state(tick, operated=operated, commanded=commanded)
         node.publish(topics.TARGET, out.target)

@@ -752,6 +752,10 @@ outside of its corridor's cone; in its corridor with a wrong attitude; too fast 
 too fast a rotation."""
 
 
+AssuranceState = Literal["unchanged", "changed", "backup", "blind", "off"]
+"""What a chaser's assurance has done with a command: see ``AssuranceStatus``."""
+
+
 class AssuranceStatus(Message, frozen=True, kw_only=True):
     """What a chaser's assurance has done with the command of the same tick (``[assurance]``).
 
@@ -764,7 +768,7 @@ class AssuranceStatus(Message, frozen=True, kw_only=True):
     """
 
     chaser: ChaserId
-    state: Literal["unchanged", "changed", "backup", "blind", "off"]
+    state: AssuranceState
     hazards: Annotated[tuple[Hazard, ...], Meta(max_length=6)]
     asked_force_N: Vector3
     asked_torque_N_m: Vector3

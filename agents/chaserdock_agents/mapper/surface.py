@@ -9,7 +9,7 @@ faces are marked, and stand for what may be behind them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
@@ -89,12 +89,11 @@ def surface_of(
         return None
     used, renamed = np.unique(triangles, return_inverse=True)
     sigma = np.sqrt(np.linalg.eigvalsh(covariances_m2[used])[:, -1])
-    triangles_used = renamed.reshape(-1, 3).astype(np.int64)
-    bare = MappedSurface(
-        landmarks_m[used], triangles_used, np.zeros(len(triangles), dtype=np.bool_), sigma
+    unseen = np.zeros(len(triangles), dtype=np.bool_)
+    surface = MappedSurface(
+        landmarks_m[used], renamed.reshape(-1, 3).astype(np.int64), unseen, sigma
     )
-    seen = _seen(bare.normals(), triangles, landmarks_m, sights)
-    return MappedSurface(bare.vertices_m, triangles_used, seen, sigma)
+    return replace(surface, seen=_seen(surface.normals(), triangles, landmarks_m, sights))
 
 
 def _sides(tetrahedra: IntArray) -> tuple[IntArray, IntArray]:

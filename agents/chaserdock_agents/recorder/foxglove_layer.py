@@ -122,9 +122,8 @@ class ViewerLayer:
     def _write_static(self, time_ns: int) -> None:
         """Write the static content: camera frames and the shapes of the bodies."""
         stamp = _time(time_ns)
-        boxes = self._scenario.target_model().boxes  # none of an unknown target
-        size_m = self._scenario.target_model().size_m
-        shapes = [("target", size_m, _TARGET_COLOUR)] if boxes else []
+        model = self._scenario.target_model()  # an unknown target has no boxes
+        shapes = [("target", model.size_m, _TARGET_COLOUR)] if model.boxes else []
         for i in range(len(self._scenario.chasers)):
             self._put(
                 "tf",
@@ -152,7 +151,7 @@ class ViewerLayer:
             else _outline([Box(body.size_m)])
         )
         mesh = self._scenario.target.nominal_mesh(_SPACING_M)
-        target = _outline(boxes) if mesh is None else _mesh_points(mesh)
+        target = _outline(model.boxes) if mesh is None else _mesh_points(mesh)
         self._put("target/points", _cloud(stamp, "target", target), time_ns)
         for i in range(len(self._scenario.chasers)):
             self._put(f"chaser/{i}/points", _cloud(stamp, f"chaser/{i}", chaser), time_ns)

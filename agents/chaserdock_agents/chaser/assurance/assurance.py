@@ -11,7 +11,6 @@ import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
 
 import msgspec
 import numpy as np
@@ -22,6 +21,7 @@ from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     ActuatorCommand,
+    AssuranceState,
     AssuranceStatus,
     Hazard,
     Level,
@@ -52,7 +52,6 @@ _RATE_SHARE = 0.99
 """Share of the greatest torque that slows a rate beyond its limit: less than all of it, so that
 rounding does not make the condition unsatisfiable."""
 _KNOWN = ("tracking", "predicting")
-State = Literal["unchanged", "changed", "backup", "blind", "off"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +135,7 @@ class Assurance:
         barriers = self._barriers(command.effective_time_ns, q)
         on_force, on_torque = self._on_force(barriers, q), self._on_torque(omega)
         missed = {barriers[k].hazard for k in on_force.missed(wrench[:3])}
-        state: State = "unchanged" if barriers else "blind"
+        state: AssuranceState = "unchanged" if barriers else "blind"
         if len(on_torque.missed(wrench[3:])):
             missed.add("rate")
         given = wrench
@@ -308,7 +307,7 @@ class Assurance:
     def _status(
         self,
         command: ActuatorCommand,
-        state: State,
+        state: AssuranceState,
         asked: Array,
         missed: Iterable[Hazard] = (),
         barriers: Iterable[Barrier] = (),

@@ -149,7 +149,7 @@ class PortCorridor:
 
     def holds(self, offset: OffsetEstimate, target: BodyState) -> bool:
         """Return whether the centre is in the cone."""
-        gap_m, aside, _ = self._seen(offset, target)
+        gap_m, aside, _, _ = self._seen(offset, target)
         rooms = [room_m for _, room_m in self._facets(gap_m, aside)]
         return gap_m > -self.docking.overdrive_m and min(rooms) > 0.0
 
@@ -163,16 +163,16 @@ class PortCorridor:
         for outward in _around(axis):
             yield (slope * axis - outward) / size, (radius_m - float(aside @ outward)) / size
 
-    def _seen(self, offset: OffsetEstimate, target: BodyState) -> tuple[float, Array, Array]:
-        """Return the gap, the offset from the axis (3,), and the velocity (3,) relative to the
-        rotating target, in TRF.
+    def _seen(self, offset: OffsetEstimate, target: BodyState) -> tuple[float, Array, Array, Array]:
+        """Return the gap, the offset from the axis (3,), and position and velocity (3,) relative to
+        the rotating target, in TRF.
         """
         position = rotations.rotate_inverse(target.q_wxyz, offset.position_m)
         velocity = rotations.rotate_inverse(target.q_wxyz, offset.velocity_m_s)
         velocity = velocity - rotations.cross(target.omega_rad_s, position)
         axis, away = np.asarray(self.port.axis), position - np.asarray(self.port.position_m)
         along_m = float(away @ axis)
-        return along_m - self.reach_m, away - along_m * axis, velocity
+        return along_m - self.reach_m, away - along_m * axis, position, velocity
 
     def barriers(
         self, offset: OffsetEstimate, target: BodyState, q_wxyz: Array, braking_m_s2: float,
@@ -180,10 +180,8 @@ class PortCorridor:
     ) -> Iterator[Barrier]:  # fmt: skip
         """Yield the conditions on a chaser in the cone, with attitude ``q_wxyz`` (4,)."""
         docking = self.docking
-        gap_m, aside, velocity = self._seen(offset, target)
-        axis = np.asarray(self.port.axis)
-        omega = target.omega_rad_s
-        position = rotations.rotate_inverse(target.q_wxyz, offset.position_m)
+        gap_m, aside, position, velocity = self._seen(offset, target)
+        axis, omega = np.asarray(self.port.axis), target.omega_rad_s
         # Of a body that moves uniformly in WRF, seen from axes that rotate at a constant rate.
         drift = -2.0 * rotations.cross(omega, velocity) - rotations.cross(
             omega, rotations.cross(omega, position)

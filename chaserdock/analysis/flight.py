@@ -651,7 +651,7 @@ class _Collector:
         for x in m.innovations or ():
             row = (x.sim_time_ns / 1e9, x.squared, x.freedoms, x.used)
             self.innovations[x.chaser].add(row)
-        known = message.status in ("tracking", "predicting")
+        known = message.is_known
         self.known.append(known)
         covariance = np.asarray(message.covariance)
         self.covariance.add(covariance[_KEPT].tolist(), covariance[_RATES].tolist())

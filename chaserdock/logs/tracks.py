@@ -26,7 +26,7 @@ def _track_of(record: Record) -> str | None:
             return f"{message.body.replace('/', '_')}_truth"
         case topics.BODY_REFERENCE:
             return f"{message.body.replace('/', '_')}_measured"
-        case topics.TARGET if message.status in ("tracking", "predicting"):
+        case topics.TARGET if message.is_known:
             return "target_estimate"
         case topics.ODOMETRY:
             return f"chaser_{message.chaser}_odometry"

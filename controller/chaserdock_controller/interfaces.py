@@ -203,6 +203,11 @@ class TargetState:
     sightings: int
     rejected: tuple[int, ...]
 
+    @property
+    def is_known(self) -> bool:
+        """Whether pose and rates may be used."""
+        return self.status in ("tracking", "predicting")
+
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:

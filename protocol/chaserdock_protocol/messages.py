@@ -585,6 +585,11 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
     relative: Annotated[tuple[RelativeEstimate, ...], Meta(max_length=256)] = ()
     innovations: Annotated[tuple[Innovation, ...], Meta(max_length=1024)] | None = None
 
+    @property
+    def is_known(self) -> bool:
+        """Whether pose and rates may be used."""
+        return self.status in ("tracking", "predicting")
+
 
 class MassEstimate(Struct, frozen=True, kw_only=True):
     """Estimated mass properties of a body.

@@ -44,7 +44,6 @@ CLEARANCE_MARGIN_M = 0.05
 """Distance (m) of the hold position beyond the entry of the corridor (docs/redundancy.md). Larger:
 more room for a chaser in the corridor; smaller: a shorter way out of it.
 """
-_KNOWN = ("tracking", "predicting")
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,7 @@ def extrapolate_target(target: TargetEstimate | None, time_ns: int) -> Array | N
     """Return the extrapolated position (3,) of the target's origin; None if the target was not
     known.
     """
-    if target is None or target.status not in _KNOWN:
+    if target is None or not target.is_known:
         return None
     elapsed_s = (time_ns - target.sim_time_ns) / 1e9
     return np.asarray(target.position_m) + elapsed_s * np.asarray(target.velocity_m_s)
@@ -159,7 +158,7 @@ def fallback_limits(scenario: FlightScenario, chaser: int) -> FallbackLimits:
 
 def target_velocity(target: TargetEstimate | None) -> Array:
     """Return the velocity (3,) of the target's origin, WRF; zero if the target was not known."""
-    if target is None or target.status not in _KNOWN:
+    if target is None or not target.is_known:
         return np.zeros(3)
     return np.asarray(target.velocity_m_s)
 

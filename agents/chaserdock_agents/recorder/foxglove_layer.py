@@ -167,7 +167,7 @@ class ViewerLayer:
                 yield f"chaser/{message.chaser}/calibration", calibration
             case BodyTruth() | BodyReference():
                 yield "tf", _frame(stamp, "world", message.body, message.position_m, message.q_wxyz)
-            case TargetEstimate() if message.status in ("tracking", "predicting"):
+            case TargetEstimate() if message.is_known:
                 where = (message.position_m, message.q_wxyz)
                 yield "tf", _frame(stamp, "world", "target/estimate", *where)
                 yield "target/estimate", _pose_in(stamp, "world", *where)

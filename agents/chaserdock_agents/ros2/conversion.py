@@ -355,7 +355,7 @@ def body_markers(
     The target is opaque while it is tracked, else transparent; without an estimate its box is
     deleted.
     """
-    known = message.status in ("tracking", "predicting")
+    known = message.is_known
     alpha = 0.875 if message.status == "tracking" else 0.25
     markers: list[Any] = [
         _marker(
@@ -463,7 +463,7 @@ class Converter:
         yield "/tf", chaser_transforms(message, self._camera)
 
     def _target(self, message: m.TargetEstimate) -> Iterable[tuple[str, Any]]:
-        if message.status in ("tracking", "predicting"):
+        if message.is_known:
             estimate = target_odometry(message)
             yield "/target/odometry", estimate
             yield "/target/pose", target_pose(estimate)

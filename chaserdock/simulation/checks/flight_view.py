@@ -165,7 +165,7 @@ class FlightView(MessageReader):
         unknown.
         """
         truth = self.states.get("target")
-        if truth is None or estimate.status not in ("tracking", "predicting"):
+        if truth is None or not estimate.is_known:
             return None
         return truth if truth.sim_time_ns == estimate.sim_time_ns else None
 

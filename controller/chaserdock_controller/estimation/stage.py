@@ -80,7 +80,7 @@ class EstimationStage:
         self.composite.disturb(o)
         found = self.estimator.update(self._inputs(o, latched_before))
         target, motions = found.target, {m.chaser: m for m in found.chasers}
-        known = target.status in ("tracking", "predicting")
+        known = target.is_known
         own = tuple(_estimated(c.odometry, motions.get(c.chaser)) for c in o.chasers)
         if known:
             self.composite.update_body(target, own)

@@ -13,6 +13,7 @@ from chaserdock_models.plane import flattened
 from chaserdock_models.shape_distance import box_table, moved
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.planar import height_m, up_in_target
+from chaserdock_protocol.scenario.schema import MAX_ESTIMATE_MARGIN_M
 
 from chaserdock_controller.bodies.target_body import TargetBody, TargetPath, predict_path
 from chaserdock_controller.interfaces import HorizonReference, RelativePose, TargetState
@@ -22,11 +23,6 @@ from .approach_cone import corridor_rows
 from .chaser_machine import ChaserMachine
 from .pointing import calibration_turns
 from .trajectories import Escape
-
-_GREATEST_MARGIN_M = 0.1
-"""Largest distance, m, that an uncertain estimate adds to the keep-out. Larger: chasers are pushed
-out of places that they can hold; smaller: a poor estimate leaves less room.
-"""
 
 
 def target_path(
@@ -196,5 +192,5 @@ class ReferenceBuilder:
         """
         sigmas_m = np.sqrt(np.linalg.eigvalsh(np.array([c[:3, :3] for c in covariances]))[:, -1])
         return np.minimum(
-            self._scenario.limits.estimate_margin_sigmas * sigmas_m, _GREATEST_MARGIN_M
+            self._scenario.limits.estimate_margin_sigmas * sigmas_m, MAX_ESTIMATE_MARGIN_M
         )

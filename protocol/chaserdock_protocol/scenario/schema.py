@@ -36,6 +36,10 @@ SOLVERS = ("rti", "ipopt", "open")
 """Names of the built-in parts that a scenario selects. Further ones may be installed (``plugins``).
 """
 
+MAX_ESTIMATE_MARGIN_M = 0.1
+"""Largest distance, m, that an uncertain estimate adds to the keep-out. Larger: chasers are pushed
+out of places that they can hold; smaller: a poor estimate leaves less room.
+"""
 MAX_STAGES = 500
 """Longest prediction: more stages could not be solved in time, and messages bound their size."""
 
@@ -225,7 +229,7 @@ class Limits(Section):
     estimate_margin_sigmas: NotNegative = Field(
         default=3.0,
         description="Standard deviations of a chaser's estimated position relative to the target "
-        "that are added to `min_distance_target_m`, at most 0.1 m in all.",
+        f"that are added to `min_distance_target_m`, at most {MAX_ESTIMATE_MARGIN_M:g} m in all.",
     )
     min_distance_shape_m: NotNegative = Field(
         default=0.0,

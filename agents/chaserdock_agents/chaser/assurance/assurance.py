@@ -31,6 +31,7 @@ from chaserdock_protocol.messages import (
     ThrusterReport,
 )
 from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.schema import MAX_ESTIMATE_MARGIN_M
 
 from .barriers import Barrier, Margin, OffsetEstimate, PortCorridor, distance_barrier
 from .nearest_input import Conditions, nearest_input
@@ -41,8 +42,6 @@ known to 1 mm/s (three sigmas of the grade `lab`) it may be 3 cm away from where
 _HISTORY_S = 0.4
 """Time over which the velocity of another chaser is measured from its estimated positions, s. They
 are known to 1 mm, the velocity so to 4 mm/s, and it lags by 0.2 s."""
-_MOST_MARGIN_M = 0.1
-"""Largest margin for errors of the estimate, m: that of the plans (`limits`)."""
 _MOST_MARGIN_M_S = 0.01
 """Largest margin for errors of velocities, m/s: half the speed of a touch (`docking.tolerances`).
 An estimate states more in its first second only."""
@@ -51,7 +50,6 @@ _PAUSE_NS = 1_000_000_000
 _RATE_SHARE = 0.99
 """Share of the greatest torque that slows a rate beyond its limit: less than all of it, so that
 rounding does not make the condition unsatisfiable."""
-_KNOWN = ("tracking", "predicting")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +90,9 @@ class Assurance:
         self._scenario, self._chaser, self._body = scenario, chaser, body
         self._interval_s = 1.0 / scenario.time.rate_hz
         self._share, self._rate_rad_s = section.braking_share, math.radians(section.max_rate_deg_s)
-        self._margin = Margin(limits.estimate_margin_sigmas, _MOST_MARGIN_M, _MOST_MARGIN_M_S)
+        self._margin = Margin(
+            limits.estimate_margin_sigmas, MAX_ESTIMATE_MARGIN_M, _MOST_MARGIN_M_S
+        )
         self._inertia, self._limits = np.array(body.inertia), body.wrench_max
         port = docking.port_of(chaser)
         self._corridor = None if port is None else PortCorridor(port, body.probe_reach_m, docking)
@@ -105,7 +105,7 @@ class Assurance:
 
     def add_estimate(self, estimate: TargetEstimate | None) -> None:
         """Take the newest estimate of the target."""
-        if estimate is None or estimate.status not in _KNOWN:
+        if estimate is None or not estimate.is_known:
             return
         if not self._estimates or estimate.tick > self._estimates[-1].tick:
             self._estimates.append(estimate)

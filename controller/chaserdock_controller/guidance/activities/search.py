@@ -34,7 +34,7 @@ class SearchActivity(Activity):
         """
         own, target, state = known.own, known.target, chaser.state
         assert own is not None
-        if target.status in ("tracking", "predicting"):
+        if target.is_known:
             q = facing(own.q_wxyz, target.position_m - own.position_m)
             return DirectCommand("search", turning_wrench(own, self._body, q, q))
         now_s = own.sim_time_ns / 1e9

@@ -6,9 +6,12 @@ from __future__ import annotations
 import math
 import statistics
 import time
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
+from chaserdock_agents.chaser.assurance.assurance import Assurance, AssuredCommand
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from common import BenchmarkFailed, Figures, Group, Options
 from flights.assured import ATTACKS, AssuredFlight, worst
@@ -55,26 +58,18 @@ def attacks(options: Options) -> Figures:
 
 
 def cost(options: Options) -> Figures:
-    """Time a call for one of four chasers, processor time: median and 99 % over commands that are
-    kept, and over those that are changed.
+    """Time what one of four chasers does in a tick, processor time: median and 99 % over commands
+    that are kept, over those that are changed, and over backups.
     """
     scenario = _assured("four-chaser-docking")
     took: dict[str, list[float]] = {"unchanged": [], "changed": [], "backup": []}
     for attack in ("ram", "chase"):
         flight = AssuredFlight(scenario, attack, options.first)
         for assurance in flight.assurances:
-            plain = assurance.assure
-
-            def timed(*values, plain=plain, **named):
-                begun = time.process_time_ns()
-                out = plain(*values, **named)
-                took.setdefault(out.status.state, []).append((time.process_time_ns() - begun) / 1e9)
-                return out
-
-            assurance.assure = timed  # type: ignore[method-assign]
+            _time(assurance, took)
         flight.fly(10.0 if options.quick else _DURATION_S)
     return {
-        f"call_{state}_{name}_s": value
+        f"tick_{state}_{name}_s": value
         for state, times in took.items()
         if len(times) > 100
         for name, value in (
@@ -82,6 +77,27 @@ def cost(options: Options) -> Figures:
             ("p99", statistics.quantiles(times, n=100)[98]),
         )
     }
+
+
+def _time(assurance: Assurance, took: dict[str, list[float]]) -> None:
+    """Add the processor time (s) of each tick to ``took``, by the state that it ends with."""
+    since_command_ns = 0
+
+    def timed(call: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapper(*values: Any, **named: Any) -> Any:
+            nonlocal since_command_ns
+            begun_ns = time.process_time_ns()
+            out = call(*values, **named)
+            since_command_ns += time.process_time_ns() - begun_ns
+            if isinstance(out, AssuredCommand):
+                took.setdefault(out.status.state, []).append(since_command_ns / 1e9)
+                since_command_ns = 0
+            return out
+
+        return wrapper
+
+    for name in ("add_estimate", "add_odometry", "assure"):
+        setattr(assurance, name, timed(getattr(assurance, name)))
 
 
 GROUP = Group({"assurance-attacks": attacks, "assurance-cost": cost}, uses=("flights", "first"))

@@ -18,7 +18,7 @@ from chaserdock_agents.chaser.assurance.barriers import (
     Margin,
     OffsetEstimate,
     PortCorridor,
-    distance_barrier,
+    distance_barriers,
     stopping_speed,
 )
 from chaserdock_agents.chaser.assurance.nearest_input import Conditions, nearest_input
@@ -96,17 +96,21 @@ def test_a_drift_is_taken_off_and_a_speed_limit_holds_alone() -> None:
 
 def test_margins_are_those_along_the_normal_and_bounded() -> None:
     covariance = np.diag([4e-6, 1e-6, 9.0])
-    offset = OffsetEstimate(
-        np.array([0.0, 2.0, 0.0]), np.array([0.3, -0.1, 0.2]), covariance, covariance
+    offsets = OffsetEstimate(
+        np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]]),
+        np.array([[0.3, -0.1, 0.2], [0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]),
+        covariance,
+        np.array([covariance] * 3),
     )
-    barrier = distance_barrier("target", offset, 0.5, NO_MARGIN)
-    assert barrier.normal == pytest.approx([0.0, 1.0, 0.0])
-    assert barrier.room_m == pytest.approx(1.5 - 0.003)
-    assert barrier.rate_m_s == pytest.approx(-0.1 - 0.003)
-    wide = OffsetEstimate(np.array([0.0, 0.0, 2.0]), np.zeros(3), covariance, covariance)
-    barrier = distance_barrier("chaser", wide, 0.5, NO_MARGIN)
-    assert barrier.room_m == pytest.approx(1.5 - NO_MARGIN.most_m)
-    assert barrier.rate_m_s == pytest.approx(-NO_MARGIN.most_m_s)
+    target, chaser, at_centre = distance_barriers(offsets, [0.5, 0.6, 0.6], NO_MARGIN)
+    assert [b.hazard for b in (target, chaser, at_centre)] == ["target", "chaser", "chaser"]
+    assert target.normal == pytest.approx([0.0, 1.0, 0.0])
+    assert target.room_m == pytest.approx(1.5 - 0.003)
+    assert target.rate_m_s == pytest.approx(-0.1 - 0.003)
+    assert chaser.room_m == pytest.approx(1.4 - NO_MARGIN.most_m)
+    assert chaser.rate_m_s == pytest.approx(-NO_MARGIN.most_m_s)
+    assert at_centre.normal == pytest.approx([1.0, 0.0, 0.0])
+    assert at_centre.room_m == pytest.approx(-0.606)
 
 
 def test_in_the_corridor_a_uniform_motion_has_the_drift_that_it_is_seen_with(

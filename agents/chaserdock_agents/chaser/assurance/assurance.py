@@ -26,14 +26,13 @@ from chaserdock_protocol.messages import (
     Hazard,
     Level,
     Odometry,
-    RelativeEstimate,
     TargetEstimate,
     ThrusterReport,
 )
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.schema import MAX_ESTIMATE_MARGIN_M
 
-from .barriers import Barrier, Margin, OffsetEstimate, PortCorridor, distance_barrier
+from .barriers import Barrier, Margin, OffsetEstimate, PortCorridor, distance_barriers
 from .nearest_input import Conditions, nearest_input
 
 _OLDEST_NS = 30_000_000_000
@@ -65,6 +64,32 @@ class AssuredCommand:
     event: tuple[Level, str, str] | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """An estimate of the target as arrays, in WRF: covariance (3, 3) of its velocity; of the
+    chasers, in the order of ``row``, positions (n, 3) relative to it and their covariances (n, 3,
+    3).
+    """
+
+    estimate: TargetEstimate
+    velocity_covariance: Array
+    row: dict[int, int]
+    offsets_m: Array
+    covariances_m2: Array
+
+    @classmethod
+    def of(cls, estimate: TargetEstimate) -> _Known:
+        turn, relative = rotations.to_matrix(estimate.q_wxyz), estimate.relative
+        covariances = np.array([r.covariance for r in relative]).reshape(-1, 6, 6)[:, :3, :3]
+        return cls(
+            estimate,
+            np.array(estimate.covariance).reshape(12, 12)[3:6, 3:6],
+            {r.chaser: k for k, r in enumerate(relative)},
+            np.array([r.position_m for r in relative]).reshape(-1, 3) @ turn.T,
+            turn @ covariances @ turn.T,
+        )
+
+
 @dataclass(frozen=True)
 class _Series:
     """Changes of commands without a pause: time of the last one, how many, whether any needed the
@@ -94,11 +119,12 @@ class Assurance:
             limits.estimate_margin_sigmas, MAX_ESTIMATE_MARGIN_M, _MOST_MARGIN_M_S
         )
         self._inertia, self._limits = np.array(body.inertia), body.wrench_max
+        self._moves = self._limits[:3] > 0.0
         port = docking.port_of(chaser)
         self._corridor = None if port is None else PortCorridor(port, body.probe_reach_m, docking)
         self._wrenches = wrench_matrix(body.thrusters) if body.actuation == "thrusters" else None
         kept = max(2, math.ceil(_HISTORY_S * scenario.time.rate_hz))
-        self._estimates: deque[TargetEstimate] = deque(maxlen=kept)
+        self._known: deque[_Known] = deque(maxlen=kept)
         self._own: deque[Odometry] = deque(maxlen=kept + 2)
         self._given = np.zeros(6)
         self._series: _Series | None = None
@@ -107,8 +133,8 @@ class Assurance:
         """Take the newest estimate of the target."""
         if estimate is None or not estimate.is_known:
             return
-        if not self._estimates or estimate.tick > self._estimates[-1].tick:
-            self._estimates.append(estimate)
+        if not self._known or estimate.tick > self._known[-1].estimate.tick:
+            self._known.append(_Known.of(estimate))
 
     def add_odometry(self, odometry: Odometry) -> None:
         """Take the chaser's newest odometry."""
@@ -187,99 +213,81 @@ class Assurance:
     def _barriers(self, time_ns: int, q: Array) -> list[Barrier]:
         """Return the conditions on the force at ``time_ns``; none while the target is unknown."""
         own = self._own[-1]
-        if not self._estimates:
+        if not self._known:
             return []
-        estimate = self._estimates[-1]
-        relative = {r.chaser: r for r in estimate.relative}
-        age_ns = own.sim_time_ns - estimate.sim_time_ns
-        if self._chaser not in relative or age_ns > _OLDEST_NS:
+        known = self._known[-1]
+        age_ns = own.sim_time_ns - known.estimate.sim_time_ns
+        if self._chaser not in known.row or age_ns > _OLDEST_NS:
             return []
-        target, offset = self._of_target(estimate, relative[self._chaser], own, time_ns)
-        limits, braking = self._scenario.limits, self._braking_m_s2
-        barriers: list[Barrier] = []
-        if self._corridor is not None and self._corridor.holds(offset, target):
-            barriers += self._corridor.barriers(
-                offset, target, q, braking, self._interval_s, self._margin
-            )
-        else:
-            least_m = limits.min_distance_target_m
-            barriers.append(distance_barrier("target", offset, least_m, self._margin))
-        for other in relative.values():
-            if other.chaser != self._chaser:
-                apart = self._of_other(estimate, other, offset, target)
-                least_m = limits.min_distance_chasers_m
-                barriers.append(distance_barrier("chaser", apart, least_m, self._margin))
-        return barriers
+        target, offset = self._of_target(known, own, time_ns)
+        offsets, limits = self._of_all(known, own, offset), self._scenario.limits
+        least_m = [limits.min_distance_target_m] + [limits.min_distance_chasers_m] * len(known.row)
+        distances = distance_barriers(offsets, least_m[: len(known.row)], self._margin)
+        if self._corridor is None or not self._corridor.holds(offset, target):
+            return distances
+        corridor = self._corridor.barriers(
+            offset, target, q, self._braking_m_s2(), self._interval_s, self._margin
+        )
+        return [*corridor, *distances[1:]]
 
-    @property
     def _braking_m_s2(self) -> float:
-        force = self._limits[:3]
-        able = force[self._body.wrench_max[:3] > 0.0]
-        return self._share * float(able.min()) / self._body.mass_kg
+        return self._share * float(self._limits[:3][self._moves].min()) / self._body.mass_kg
 
     def _of_target(
-        self, estimate: TargetEstimate, relative: RelativeEstimate, own: Odometry, time_ns: int
+        self, known: _Known, own: Odometry, time_ns: int
     ) -> tuple[BodyState, OffsetEstimate]:
         """Return the target, and the chaser's offset from it, both at ``time_ns``.
 
         From the estimate to the chaser's newest odometry the chaser has moved as that says; from
         there on it moves under the command before.
         """
+        estimate, row = known.estimate, known.row[self._chaser]
         velocity, omega = np.array(estimate.velocity_m_s), np.array(estimate.omega_rad_s)
-        q_then = np.array(estimate.q_wxyz)
+        age_s = (own.sim_time_ns - estimate.sim_time_ns) / 1e9
+        ahead_s = (time_ns - own.sim_time_ns) / 1e9
         then = next((o for o in self._own if o.tick == estimate.tick), None)
-        age_s, ahead_s = (
-            (own.sim_time_ns - estimate.sim_time_ns) / 1e9,
-            (time_ns - own.sim_time_ns) / 1e9,
-        )
-        position = rotations.rotate(q_then, relative.position_m)
         if then is None:  # too long ago: odometry and estimate share WRF
             position = np.subtract(own.position_m, estimate.position_m)
         else:
-            position = position + np.subtract(own.position_m, then.position_m)
+            position = known.offsets_m[row] + np.subtract(own.position_m, then.position_m)
         drift = np.subtract(own.velocity_m_s, velocity)
         pushed = rotations.rotate(own.q_wxyz, self._given[:3]) / self._body.mass_kg
         position = position - velocity * age_s + drift * ahead_s + 0.5 * pushed * ahead_s**2
-        q_target = rotations.integrate(q_then, omega, age_s + ahead_s)
-        covariance = np.reshape(estimate.covariance, (12, 12))[3:6, 3:6]
-        turn = rotations.to_matrix(q_then)
-        own_covariance = np.reshape(relative.covariance, (6, 6))[:3, :3]
-        speed_covariance = np.reshape(own.velocity_covariance_m2_s2, (3, 3)) + covariance
+        q_target = rotations.integrate(np.array(estimate.q_wxyz), omega, age_s + ahead_s)
+        speed_covariance = (
+            np.array(own.velocity_covariance_m2_s2).reshape(3, 3) + known.velocity_covariance
+        )
         target = BodyState(np.array(estimate.position_m), velocity, q_target, omega)
         return target, OffsetEstimate(
             position,
             drift + pushed * ahead_s,
-            turn @ own_covariance @ turn.T + (age_s + ahead_s) ** 2 * speed_covariance,
+            known.covariances_m2[row] + (age_s + ahead_s) ** 2 * speed_covariance,
             speed_covariance,
         )
 
-    def _of_other(
-        self,
-        estimate: TargetEstimate,
-        other: RelativeEstimate,
-        offset: OffsetEstimate,
-        target: BodyState,
-    ) -> OffsetEstimate:
-        """Return the chaser's offset from another one, which moves on as it did relative to the
-        target.
+    def _of_all(self, known: _Known, own: Odometry, offset: OffsetEstimate) -> OffsetEstimate:
+        """Return the chaser's offsets from the target and from the others, which move on as they
+        did relative to the target.
         """
-        first = next(
-            (e, r) for e in self._estimates for r in e.relative if r.chaser == other.chaser
-        )
-        at_first = rotations.rotate(first[0].q_wxyz, first[1].position_m)
-        at_last = rotations.rotate(estimate.q_wxyz, other.position_m)
-        elapsed_s = (estimate.sim_time_ns - first[0].sim_time_ns) / 1e9
-        velocity = (at_last - at_first) / elapsed_s if elapsed_s > 0.0 else np.zeros(3)
-        own_age_s = (self._own[-1].sim_time_ns - estimate.sim_time_ns) / 1e9
-        at_last = at_last + velocity * own_age_s
-        turn = rotations.to_matrix(target.q_wxyz)
-        its = turn @ np.reshape(other.covariance, (6, 6))[:3, :3] @ turn.T
-        spread_s = elapsed_s if elapsed_s > 0.0 else self._interval_s
+        now_ns, others = known.estimate.sim_time_ns, [c for c in known.row if c != self._chaser]
+        firsts = [next(k for k in self._known if c in k.row) for c in others]
+        rows = [known.row[c] for c in others]
+        before = [k.offsets_m[k.row[c]] for k, c in zip(firsts, others, strict=True)]
+        elapsed_s = [(now_ns - k.estimate.sim_time_ns) / 1e9 for k in firsts]
+        span_s = np.array([s or self._interval_s for s in elapsed_s])[:, None]
+        # Row 0 is the target: no offset from itself.
+        at, velocity = np.zeros((2, len(known.row), 3))
+        at[1:], its = known.offsets_m[rows], np.zeros((len(known.row), 3, 3))
+        velocity[1:] = (at[1:] - np.array(before).reshape(-1, 3)) / span_s
+        its[1:] = known.covariances_m2[rows]
+        at += velocity * ((own.sim_time_ns - now_ns) / 1e9)
+        positions = offset.position_covariance + its
+        its[1:] /= span_s[..., None] ** 2
         return OffsetEstimate(
-            offset.position_m - at_last,
+            offset.position_m - at,
             offset.velocity_m_s - velocity,
-            offset.position_covariance + its,
-            offset.velocity_covariance + its / spread_s**2,
+            positions,
+            offset.velocity_covariance + its,
         )
 
     # -- conditions --------------------------------------------------------------------------------
@@ -287,13 +295,14 @@ class Assurance:
     def _on_force(self, barriers: list[Barrier], q: Array) -> Conditions:
         """Return the conditions on the force for an attitude (4,)."""
         normals = np.array([b.normal for b in barriers]).reshape(-1, 3)
-        least = [b.least_acceleration(self._braking_m_s2, self._interval_s) for b in barriers]
+        braking_m_s2 = self._braking_m_s2()
+        least = [b.least_acceleration(braking_m_s2, self._interval_s) for b in barriers]
         rows = rotations.rotate_inverse(q, normals) / self._body.mass_kg
         return Conditions(rows, np.array(least), self._limits[:3])
 
     def _on_torque(self, omega: Array) -> Conditions:
         """Return the condition that the rate (3,) stays within its limit, along its direction."""
-        speed, limits = float(np.linalg.norm(omega)), self._limits[3:]
+        speed, limits = math.hypot(*omega.tolist()), self._limits[3:]
         if speed == 0.0:
             return Conditions(np.zeros((0, 3)), np.zeros(0), limits)
         about = omega / speed

@@ -9,8 +9,9 @@ Its safe set is therefore the set from which braking is a safe abort.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from chaserdock_models import rotations
@@ -92,23 +93,24 @@ def stopping_speed(room_m: float, rate_m_s: float, braking_m_s2: float, interval
 
 @dataclass(frozen=True, eq=False)
 class OffsetEstimate:
-    """Position and velocity (3,) of a chaser relative to another body, with covariances (3, 3)."""
+    """Position and velocity (..., 3) of a chaser relative to other bodies, with covariances (...,
+    3, 3).
+    """
 
     position_m: Array
     velocity_m_s: Array
     position_covariance: Array
     velocity_covariance: Array
 
-    def barrier(
-        self, hazard: Hazard, normal: Array, room_m: float, rate_m_s: float, margin: Margin,
-        **limits: float,
-    ) -> Barrier:  # fmt: skip
-        """Return a barrier whose room and rate are less by the margins of this offset's errors."""
-        room_sigma_m = math.sqrt(max(0.0, float(normal @ self.position_covariance @ normal)))
-        rate_sigma_m_s = math.sqrt(max(0.0, float(normal @ self.velocity_covariance @ normal)))
-        room_m -= min(margin.sigmas * room_sigma_m, margin.most_m)
-        rate_m_s -= min(margin.sigmas * rate_sigma_m_s, margin.most_m_s)
-        return Barrier(hazard, normal, room_m, rate_m_s, **limits)
+    def margins(self, normals: Array, margin: Margin) -> tuple[list[float], list[float]]:
+        """Return the margins of distance, m, and of speed, m/s, along unit vectors (n, 3)."""
+        out = []
+        bounds = (margin.most_m, margin.most_m_s)
+        covariances = (self.position_covariance, self.velocity_covariance)
+        for covariance, most in zip(covariances, bounds, strict=True):
+            variances = ((normals[:, None] @ covariance)[:, 0] * normals).sum(axis=1).tolist()
+            out.append([min(margin.sigmas * math.sqrt(max(0.0, v)), most) for v in variances])
+        return out[0], out[1]
 
 
 @dataclass(frozen=True)
@@ -122,17 +124,28 @@ class Margin:
     most_m_s: float
 
 
-def distance_barrier(
-    hazard: Hazard, offset: OffsetEstimate, least_m: float, margin: Margin
-) -> Barrier:
-    """Return the barrier that keeps a distance between two centres.
+def distance_barriers(
+    offsets: OffsetEstimate, least_m: Sequence[float], margin: Margin
+) -> list[Barrier]:
+    """Return the barriers that keep distances (n,) from the centre of the target, the first row of
+    ``offsets`` (n, 3), and from those of other chasers.
 
     The sideways velocity only adds to the distance; it is left out.
     """
-    distance_m = float(np.linalg.norm(offset.position_m))
-    outward = offset.position_m / distance_m if distance_m > 0.0 else np.array([1.0, 0.0, 0.0])
-    rate_m_s = float(outward @ offset.velocity_m_s)
-    return offset.barrier(hazard, outward, distance_m - least_m, rate_m_s, margin)
+    distances_m = np.sqrt((offsets.position_m**2).sum(axis=1))
+    outward = offsets.position_m / np.where(distances_m > 0.0, distances_m, 1.0)[:, None]
+    outward[distances_m == 0.0] = [1.0, 0.0, 0.0]
+    rates_m_s = (outward * offsets.velocity_m_s).sum(axis=1).tolist()
+    off_m, off_m_s = offsets.margins(outward, margin)
+    return [
+        Barrier(
+            "chaser" if k else "target",
+            outward[k],
+            distance_m - least_m[k] - off_m[k],
+            rates_m_s[k] - off_m_s[k],
+        )
+        for k, distance_m in enumerate(distances_m.tolist())
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,18 +163,25 @@ class PortCorridor:
     def holds(self, offset: OffsetEstimate, target: BodyState) -> bool:
         """Return whether the centre is in the cone."""
         gap_m, aside, _, _ = self._seen(offset, target)
-        rooms = [room_m for _, room_m in self._facets(gap_m, aside)]
-        return gap_m > -self.docking.overdrive_m and min(rooms) > 0.0
+        _, rooms_m = self._facets(gap_m, aside)
+        return gap_m > -self.docking.overdrive_m and bool(rooms_m.min() > 0.0)
 
-    def _facets(self, gap_m: float, aside: Array) -> Iterator[tuple[Array, float]]:
-        """Yield the inward normal (3,), TRF, and the distance of each plane of the cone."""
-        axis = np.asarray(self.port.axis)
+    @cached_property
+    def _planes(self) -> tuple[Array, Array, float, float]:
+        """Planes of the cone: inward normals (k, 3), TRF, and, per metre of offset (3,), of gap,
+        and constant, their distances.
+        """
         inscribed = math.cos(math.pi / _FACETS)
         slope = inscribed * math.tan(math.radians(self.docking.corridor_angle_deg))
-        radius_m = inscribed * 2.0 * self.docking.corridor.lateral_m + slope * gap_m
-        size = math.hypot(1.0, slope)
-        for outward in _around(axis):
-            yield (slope * axis - outward) / size, (radius_m - float(aside @ outward)) / size
+        axis, size = np.asarray(self.port.axis), math.hypot(1.0, slope)
+        outward = np.array(list(_around(axis))) / size
+        constant_m = inscribed * 2.0 * self.docking.corridor.lateral_m / size
+        return slope / size * axis - outward, -outward, slope / size, constant_m
+
+    def _facets(self, gap_m: float, aside: Array) -> tuple[Array, Array]:
+        """Return inward normals (k, 3), TRF, and distances (k,) of the planes of the cone."""
+        normals, per_m, per_gap, constant_m = self._planes
+        return normals, per_m @ aside + (per_gap * gap_m + constant_m)
 
     def _seen(self, offset: OffsetEstimate, target: BodyState) -> tuple[float, Array, Array, Array]:
         """Return the gap, the offset from the axis (3,), and position and velocity (3,) relative to
@@ -187,25 +207,22 @@ class PortCorridor:
             omega, rotations.cross(omega, position)
         )
 
-        def of(hazard: Hazard, normal: Array, room_m: float, **limits: float) -> Barrier:
-            return offset.barrier(
-                hazard,
-                rotations.rotate(target.q_wxyz, normal),
-                room_m,
-                float(normal @ velocity),
-                margin,
-                drift_m_s2=float(normal @ drift),
-                **limits,
-            )
-
-        for normal, room_m in self._facets(gap_m, aside):
-            yield of("corridor", normal, room_m)
+        normals, rooms_m = self._facets(gap_m, aside)
+        found: list[tuple[Hazard, float, float]] = [
+            ("corridor", room_m, -math.inf) for room_m in rooms_m.tolist()
+        ]
         q_off = rotations.multiply(rotations.conjugate(target.q_wxyz), q_wxyz)
         if axis_error_deg(self.port, q_off) > docking.corridor.angle_deg:
-            yield of("alignment", axis, gap_m - docking.entry_m + ENTRY_SLACK_M)
+            found.append(("alignment", gap_m - docking.entry_m + ENTRY_SLACK_M, -math.inf))
         next_m = max(0.0, min(gap_m, gap_m + float(velocity @ axis) * interval_s))
-        fastest_m_s = self._fastest(next_m, braking_m_s2)
-        yield of("closing speed", axis, math.inf, slowest_m_s=-fastest_m_s)
+        found.append(("closing speed", math.inf, -self._fastest(next_m, braking_m_s2)))
+        normals = np.vstack([normals, np.tile(axis, (len(found) - len(normals), 1))])
+        rates_m_s, drifts = (normals @ velocity).tolist(), (normals @ drift).tolist()
+        normals = rotations.rotate(target.q_wxyz, normals)
+        off_m, off_m_s = offset.margins(normals, margin)
+        for k, (hazard, room_m, slowest_m_s) in enumerate(found):
+            rate_m_s = rates_m_s[k] - off_m_s[k]
+            yield Barrier(hazard, normals[k], room_m - off_m[k], rate_m_s, drifts[k], slowest_m_s)
 
     def _fastest(self, gap_m: float, braking_m_s2: float) -> float:
         """Return the greatest closing speed at a gap, m/s: by braking, the speed of the corridor at

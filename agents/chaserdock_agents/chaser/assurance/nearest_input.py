@@ -33,11 +33,12 @@ class Conditions:
 
     def margins(self, asked: Array) -> Array:
         """Return by how much an input (3,), clipped to its limits, exceeds each condition, (k,)."""
-        return self.rows @ np.clip(asked, -self.limits, self.limits) - self.least
+        within = np.minimum(np.maximum(asked, -self.limits), self.limits)
+        return self.rows @ within - self.least
 
     def missed(self, asked: Array) -> IntArray:
         """Return the numbers (m,) of the conditions that an input (3,) does not satisfy."""
-        return np.flatnonzero(self.margins(asked) < -_TOLERANCE)
+        return (self.margins(asked) < -_TOLERANCE).nonzero()[0]
 
 
 def nearest_input(asked: Array, conditions: Conditions) -> tuple[Array, bool]:
@@ -48,6 +49,8 @@ def nearest_input(asked: Array, conditions: Conditions) -> tuple[Array, bool]:
 
     Raises RuntimeError if the solver fails.
     """
+    if not len(conditions.missed(asked)):
+        return np.clip(asked, -conditions.limits, conditions.limits), True
     axes = np.flatnonzero(conditions.limits)
     unit = conditions.limits[axes]
     rows = np.ascontiguousarray(conditions.rows[:, axes] * unit)

@@ -6,26 +6,100 @@ from __future__ import annotations
 import math
 import statistics
 import time
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from chaserdock_agents.chaser.assurance.assurance import Assurance, AssuredCommand
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from common import BenchmarkFailed, Figures, Group, Options
+from common import BenchmarkFailed, Figures, Group, KeptResults, Options, seeds_of
 from flights.assured import ATTACKS, AssuredFlight, worst
+
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import summary_of
+from chaserdock.simulation.mission import simulate
+from chaserdock.summary import Summary
+
+from .rates import STATISTICAL
 
 _FLIGHTS, _QUICK_FLIGHTS = 50, 3
 _SCENARIOS = ("four-chaser-docking", "four-chaser-capture")
 _DURATION_S = 40.0
 
 
+@dataclass(frozen=True)
+class AssuredMission:
+    """How a mission under the NMPC ended: ``missed`` criteria; commands changed, and all."""
+
+    missed: tuple[str, ...]
+    changed: int
+    commands: int
+    hazards: dict[str, int]
+
+    def line(self) -> str:
+        """Return the flight as a line of text."""
+        named = "".join(f"; {count} for {hazard}" for hazard, count in self.hazards.items())
+        return f"{self.changed} of {self.commands} changed{named}; {'; '.join(self.missed) or 'ok'}"
+
+
+def _assured_file(name: str, folder: str) -> Path:
+    file = Path(folder) / "assured.toml"
+    file.write_text(f'extends = "{name}"\nname = "{name}-assured"\n[assurance]\n')
+    return file
+
+
 def _assured(name: str) -> Scenario:
     with TemporaryDirectory() as folder:
-        file = Path(folder) / "assured.toml"
-        file.write_text(f'extends = "{name}"\nname = "assured"\n[assurance]\n')
-        return load_scenario(file)
+        return load_scenario(_assured_file(name, folder))
+
+
+def _fly_mission(name: str, overrides: tuple[str, ...], seed: int) -> AssuredMission:
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        flight = simulate(_assured_file(name, folder), out, (*overrides, f"seed={seed}"))
+        if flight.crashes or flight.stalled:
+            raise BenchmarkFailed(f"{name}, seed {seed}: {flight.crashes or flight.stalled}")
+        recorded = load_flight(out / "mission.mcap")
+        summary = Summary.from_dict(summary_of(recorded))
+    chasers = summary.chasers.values()
+    hazards: Counter[str] = Counter()
+    for chaser in chasers:
+        hazards.update({} if chaser.assurance is None else chaser.assurance.hazards)
+    return AssuredMission(
+        tuple(summary.failures),
+        sum(c.assurance.changed for c in chasers if c.assurance is not None),
+        sum(len(history.time_s) for history in recorded.assurance.values()),
+        dict(hazards),
+    )
+
+
+def missions(options: Options) -> Figures:
+    """Fly missions of ``--scenarios`` under the NMPC with assurance, other errors by seed (1;
+    statistical perception): how many succeed, and the share of commands that were changed.
+    """
+    figures: Figures = {}
+    for name in options.scenarios:
+        overrides = (STATISTICAL, *options.set)
+        if options.quick:
+            overrides = (*overrides, "duration_s=14.0", "settling_s=5.0", "timeline=[]")
+            overrides = (*overrides, "steady_until_s=5.0", "success={}")
+        results = KeptResults(
+            options.results, {"assured": name, "set": list(overrides)}, AssuredMission
+        )
+        seeds = seeds_of(options, 1, 1)
+        fly = partial(_fly_mission, name, overrides)
+        flights = results.of(seeds, fly, AssuredMission.line, jobs=options.jobs)
+        successes = sum(not flight.missed for flight in flights)
+        commands = sum(flight.commands for flight in flights)
+        share = sum(flight.changed for flight in flights) / commands
+        print(f"{name}: {successes} of {len(flights)}, {share:.2%} changed", flush=True)
+        key = name.replace("-", "_")
+        figures |= {f"{key}_successes": successes, f"{key}_changed_share": share}
+    return figures
 
 
 def attacks(options: Options) -> Figures:
@@ -100,4 +174,8 @@ def _time(assurance: Assurance, took: dict[str, list[float]]) -> None:
         setattr(assurance, name, timed(getattr(assurance, name)))
 
 
-GROUP = Group({"assurance-attacks": attacks, "assurance-cost": cost}, uses=("flights", "first"))
+GROUP = Group(
+    {"assurance-attacks": attacks, "assurance-cost": cost, "assurance-missions": missions},
+    uses=("flights", "first", "set", "results", "jobs"),
+    on_request=("assurance-missions",),
+)

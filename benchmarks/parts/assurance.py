@@ -62,7 +62,8 @@ def _fly_mission(name: str, overrides: tuple[str, ...], seed: int) -> AssuredMis
         out = Path(folder) / "run"
         flight = simulate(_assured_file(name, folder), out, (*overrides, f"seed={seed}"))
         if flight.crashes or flight.stalled:
-            raise BenchmarkFailed(f"{name}, seed {seed}: {flight.crashes or flight.stalled}")
+            reason = flight.crashes or flight.stalled
+            raise BenchmarkFailed(f"{name}, seed {seed}: {reason}", {})
         recorded = load_flight(out / "mission.mcap")
         summary = Summary.from_dict(summary_of(recorded))
     chasers = summary.chasers.values()

@@ -31,6 +31,8 @@ class LayoutOption(StrEnum):
 
     speed = "speed+"
     bop = "bop"
+    euroc = "euroc"
+    colmap = "colmap"
     both = "both"
 
 
@@ -60,7 +62,7 @@ def dataset(
         str,
         typer.Argument(
             help="folder of a dataset (ours, or SPEED, SPEED+ or BOP) to score a perception on; "
-            "with --out: scenario whose target is drawn",
+            "with --out: scenario whose target is drawn, or the log of a flight",
             autocompletion=complete_scenario,
         ),
     ],
@@ -76,7 +78,12 @@ def dataset(
         ),
     ] = None,
     layout: Annotated[
-        LayoutOption, typer.Option("--format", help="--out: layout of images and labels")
+        LayoutOption,
+        typer.Option(
+            "--format",
+            help="--out: layout of images and labels: speed+, bop or both; of a flight: euroc, "
+            "colmap or both",
+        ),
     ] = LayoutOption.both,
     seed: Annotated[
         int,
@@ -152,7 +159,8 @@ def dataset(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="show no progress")] = False,
 ) -> None:
     """Score a perception on labelled images (SPEED score, ADD); or draw such images: random views
-    of a scenario's target with pose labels, in the SPEED+ and BOP formats.
+    of a scenario's target with pose labels, in the SPEED+ and BOP formats; or write the images of a
+    flight as a sequence with true poses, for SLAM and structure from motion.
     """
     if out is None:
         drawing = (
@@ -167,6 +175,16 @@ def dataset(
         return
     scoring = ("name", "scenario", "split", "domain", "object", "as_json")
     refuse_options(context, scoring, "not with --out")
+    if _is_log(Path(source)):
+        drawing = (
+            "images", "seed", "range_m", "offset", "phase", "validation", "overrides", "renderer",
+            "samples", "jobs",
+        )  # fmt: skip
+        refuse_options(context, drawing, "not for a flight")
+        _write_sequence(Path(source), out, layout)
+        return
+    if layout in (LayoutOption.euroc, LayoutOption.colmap):
+        raise fail(f"--format {layout.value}: only for a flight; give the folder of its log")
     if images is None:
         raise fail("--images: needed with --out")
     if renderer is not RendererOption.path:
@@ -191,6 +209,24 @@ def dataset(
         samples if renderer is RendererOption.path else None, jobs,
     )  # fmt: skip
     print(f"{out}: {images} images of {loaded.target.model}, {' and '.join(layouts)}, seed {seed}")
+
+
+def _is_log(source: Path) -> bool:
+    return source.suffix == ".mcap" or next(source.glob("*.mcap"), None) is not None
+
+
+def _write_sequence(log: Path, out: Path, layout: LayoutOption) -> None:
+    """Write the images of a flight as a sequence."""
+    from chaserdock.datasets.sequences import export_sequence
+    from chaserdock.datasets.types import SequenceLayout
+
+    if layout in (LayoutOption.speed, LayoutOption.bop):
+        raise fail(f"--format {layout.value}: not for a flight; give euroc or colmap")
+    layouts: tuple[SequenceLayout, ...] = (
+        ("euroc", "colmap") if layout is LayoutOption.both else (layout.value,)
+    )
+    for chaser, images in export_sequence(log, out, layouts).items():
+        print(f"{out}: {images} images of chaser {chaser}, {' and '.join(layouts)}")
 
 
 def _score(

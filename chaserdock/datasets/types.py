@@ -19,6 +19,18 @@ from numpy.typing import NDArray
 Split = Literal["train", "validation"]
 Layout = Literal["speed+", "bop"]
 """Layouts that are written."""
+SequenceLayout = Literal["euroc", "colmap"]
+"""Layouts of the images of a flight."""
+_COEFFICIENTS: dict[str, tuple[int, ...]] = {
+    "speed+": (0, 4, 5),
+    "bop": (0,),
+    "euroc": (0, 4),
+    "colmap": (0, 4, 5, 8),
+}
+"""Coefficients of a perspective lens that a layout can state."""
+_OTHER = {"speed+": "bop", "bop": "speed+", "euroc": "colmap", "colmap": "euroc"}
+_FISHEYES = ("euroc", "colmap")
+"""Layouts that can state an equidistant lens."""
 
 
 class DatasetError(ChaserdockError):
@@ -27,19 +39,19 @@ class DatasetError(ChaserdockError):
     """
 
 
-def check_camera(camera: Camera, layout: Layout) -> None:
+def check_camera(camera: Camera, layout: Layout | SequenceLayout) -> None:
     """Raise DatasetError for a lens that a layout cannot state."""
-    key = "camera.intrinsics"
-    if layout == "bop" and camera.distorts:
-        raise DatasetError(
-            f"{key}.distortion: the BOP format has no lens distortion; use --format speed+, or a "
-            "camera without it"
-        )
-    if camera.lens_model != "perspective" or len(camera.distortion) > 5:
-        raise DatasetError(
-            f"{key}.distortion: the SPEED+ format has k1, k2, p1, p2, k3 only; this lens is "
-            f"{camera.lens_model} with {len(camera.distortion)} coefficients"
-        )
+    if camera.lens_model == "equidistant" and layout in _FISHEYES:
+        return
+    able, number = _COEFFICIENTS[layout], len(camera.distortion)
+    if camera.lens_model == "perspective" and number in able:
+        return
+    fisheye = ", or an equidistant lens" if layout in _FISHEYES else ""
+    hint = f"; use --format {_OTHER[layout]}" if number in _COEFFICIENTS[_OTHER[layout]] else ""
+    raise DatasetError(
+        f"camera.intrinsics.distortion: the layout {layout} has 0 to {able[-1]} coefficients of a "
+        f"perspective lens{fisheye}; this one is {camera.lens_model} with {number}{hint}"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,9 @@
 """
 
 from common import main
-from parts import unknown_map
+from parts import unknown_colmap, unknown_map
 
-GROUPS = (unknown_map.GROUP,)
+GROUPS = (unknown_map.GROUP, unknown_colmap.GROUP)
 
 if __name__ == "__main__":
     main(__doc__, GROUPS)

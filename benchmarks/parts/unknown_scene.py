@@ -109,15 +109,22 @@ class Exposure:
     odometry: BodyState
 
 
+def _name(chaser: int, number: int) -> str:
+    return f"{chaser}-{number:05d}.jpg"
+
+
 class UnknownImages:
-    """The images of a case in the order of time; rendered where ``folder`` does not keep them."""
+    """The images of a case in the order of time; rendered where ``folder`` does not keep them.
+
+    ``folder``: of the case's own, from then on.
+    """
 
     def __init__(self, case: SceneCase, folder: Path) -> None:
         self.case, self.scenario = case, case.scenario()
         key = {k: v for k, v in asdict(case).items() if k != "duration_s"}
         name = hashlib.sha256(repr(sorted(key.items())).encode()).hexdigest()[:12]
-        self._folder = folder / f"{case.mesh}-{name}"
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder / f"{case.mesh}-{name}"
+        self.folder.mkdir(parents=True, exist_ok=True)
 
     @property
     def camera(self) -> Camera:
@@ -159,8 +166,20 @@ class UnknownImages:
                 odometry = sensor.measure(i, tick, self.state(f"chaser/{i}", time_s))
                 yield Exposure(i, time_s, self._image(i, number, time_s), odometry)
 
+    def kept(self, every: int, until_s: float) -> dict[str, tuple[int, float]]:
+        """Render each chaser's images, ``every`` numbers apart, into ``folder``; return chaser and
+        time (s) of each, by name.
+        """
+        found = {}
+        for number in range(0, round(30.0 * until_s / TICKS_PER_IMAGE), every):
+            time_s = number * TICKS_PER_IMAGE / 30.0
+            for i in range(len(self.scenario.chasers)):
+                self._image(i, number, time_s)
+                found[_name(i, number)] = i, time_s
+        return found
+
     def _image(self, chaser: int, number: int, time_s: float) -> NDArray[np.uint8]:
-        path = self._folder / f"{chaser}-{number:05d}.jpg"
+        path = self.folder / _name(chaser, number)
         if not path.exists():
             bodies = [TARGET, *(f"chaser/{i}" for i in range(len(self.scenario.chasers)))]
             states = {body: self.state(body, time_s) for body in bodies}

@@ -14,6 +14,7 @@ import tempfile
 import time
 from argparse import ArgumentParser
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -22,10 +23,13 @@ import numpy as np
 from chaserdock_controller.nmpc.rti import RtiSolver
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.transport import RawSample
-from common import ROOT, Figures, Group, Options
+from common import ROOT, BenchmarkFailed, Figures, Group, KeptResults, Options, seeds_of
 
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import summary_of
 from chaserdock.simulation.checks.flight_checks import FlightChecks
 from chaserdock.simulation.mission import simulate
+from chaserdock.summary import Summary
 
 SCENARIO = ROOT / "scenarios" / "swarm-64.toml"
 SAMPLE_S = 0.002
@@ -148,6 +152,51 @@ def swarm(options: Options) -> Figures:
     return figures
 
 
+@dataclass(frozen=True)
+class SwarmFlight:
+    """How a flight of the whole scenario ended: violated invariants, criteria that it missed, and
+    processor time.
+    """
+
+    violations: tuple[str, ...]
+    missed: tuple[str, ...]
+    cpu_s: float
+
+    def line(self) -> str:
+        """Return the flight as a line of text."""
+        return f"{'; '.join((*self.violations, *self.missed)) or 'ok'}; {self.cpu_s:.0f} s"
+
+
+def fly_whole(seed: int) -> SwarmFlight:
+    """Fly ``swarm-64`` with other errors of its sensors, as ``seed`` draws them."""
+    overrides = (f"seed={seed}",)
+    checks = FlightChecks(load_scenario(SCENARIO, overrides))
+    begin_s = time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        checks.end(simulate(SCENARIO, out, overrides, checks.observe))
+        missed = Summary.from_dict(summary_of(load_flight(out / "mission.mcap"))).failures
+    violations = tuple(str(v) for v in checks.violations)
+    return SwarmFlight(violations, tuple(missed), time.process_time() - begin_s)
+
+
+def exchange(options: Options) -> Figures:
+    """Fly the whole ``swarm-64`` with other errors of sensors by seed (20; ``--quick``: 1), and
+    judge all invariants of `simulate` and the scenario's criteria.
+    """
+    results = KeptResults(options.results, {"scenario": "swarm-64"}, SwarmFlight)
+    flights = results.of(seeds_of(options, 20, 1), fly_whole, SwarmFlight.line, jobs=options.jobs)
+    figures: Figures = {
+        "flights": len(flights),
+        "without_violation": sum(not f.violations for f in flights),
+        "successes": sum(not f.missed for f in flights),
+        "cpu_s": float(np.median([f.cpu_s for f in flights])),
+    }
+    if figures["without_violation"] < len(flights):
+        raise BenchmarkFailed("an invariant is violated", figures)
+    return figures
+
+
 def add_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--swarm",
@@ -163,4 +212,9 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--swarm-rate-hz", type=int, default=5, help="ticks per second of swarm")
 
 
-GROUP = Group({"swarm": swarm}, add_options=add_options)
+GROUP = Group(
+    {"swarm": swarm, "exchange": exchange},
+    ("flights", "first", "results", "jobs"),
+    add_options,
+    ("exchange",),
+)

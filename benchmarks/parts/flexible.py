@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import subprocess
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from flights.engine_comparison import ENGINES
 
 REFERENCE = ROOT / "tests" / "world" / "basilisk_flexible.json"
 BAR_SHARE = 1e-4
+CHASER = "chaser/0"
 
 _PANELS = (
     "{{mass_share=0.04, position_m=[0.02,0.3,0.01], frequency_hz=[2.0,3.0,{hz}]}},"
@@ -36,7 +38,8 @@ CASES = {
 }
 """What the chaser carries: panels that bend along Z at the given frequency, and fuel."""
 
-DURATION_S, HZ = 100, 960
+SECONDS, HZ = (1, 2, 5, 10, 20, 50, 100), 960
+"""Times of the comparison, s, and physics steps in a second."""
 START = BodyState(
     np.array([3.0, -2.0, 1.0]),
     np.array([0.01, 0.02, -0.03]),
@@ -49,6 +52,13 @@ PULSES = (
     (40000, 44800, (0.0, 0.1, 0.2, 0.004, -0.003, 0.001)),
 )
 """First and last physics step, and the wrench at CRF's origin (body axes), N and N m."""
+
+BASILISK_EVERY = 4
+"""Physics steps in a step of Basilisk (RK4)."""
+LEAD_S = 0.5 / HZ
+"""Half a step, by which loads of the engines act early: a step begins with a change of velocity for
+the whole of it (engine.py). Basilisk starts so much earlier, and its results are led by it.
+"""
 
 # Runs in Basilisk's interpreter: cases on stdin, states at whole seconds on stdout. A mass on
 # springs along three axes is a chain of three translations, of which the last has the mass.
@@ -126,3 +136,148 @@ for case in given["cases"]:
     results.append(samples)
 print("RESULT" + json.dumps(results))
 """
+
+
+def scenario_of(case: str, engine: str) -> Scenario:
+    """Return the scenario of a case: the chaser of ``docking-contact``, far from its target."""
+    overrides = (f"truth.oscillator=[{CASES[case]}]", f'world.engine="{engine}"')
+    return load_scenario(shipped_scenario("docking-contact"), overrides)
+
+
+def _basilisk_case(name: str) -> dict[str, Any]:
+    """Return a case as Basilisk takes it: its hub is the rigid rest of the chaser."""
+    scenario = scenario_of(name, "pybullet")
+    physics, whole = Physics(scenario), chaser_plant(scenario, 0).centre_of_mass_m
+    rest, carried = physics.plants[CHASER], physics.carried[CHASER]
+    physics.close()
+    masses = []
+    stated = scenario.truth.oscillators("chaser")
+    for oscillator, mass in zip(stated, carried.masses_kg.tolist(), strict=True):
+        omega = 2.0 * math.pi * np.array(oscillator.frequencies_hz)
+        masses.append(
+            {
+                "mass": mass,
+                "place": oscillator.position_m,
+                "stiffness": (mass * omega**2).tolist(),
+                "damping": (2.0 * oscillator.damping_share * mass * omega).tolist(),
+            }
+        )
+    q = rotations.multiply(START.q_wxyz, rotations.exp(-LEAD_S * START.omega_rad_s))
+    velocity = START.velocity_m_s + rotations.rotate(q, np.cross(START.omega_rad_s, whole))
+    position = START.position_m - LEAD_S * START.velocity_m_s + rotations.rotate(q, whole)
+    return {
+        "name": name,
+        "hub": {
+            "mass": rest.mass_kg,
+            "centre": rest.centre_of_mass_m.tolist(),
+            "inertia": rest.inertia_kg_m2.tolist(),
+        },
+        "masses": masses,
+        "position": position.tolist(),
+        "velocity": velocity.tolist(),
+        "sigma": (q[1:] / (1.0 + q[0])).tolist(),
+        "omega": START.omega_rad_s.tolist(),
+    }
+
+
+def fly_in_basilisk(python: str) -> dict[str, list[dict[str, Any]]]:
+    """Return, by case, position, attitude and deflections in Basilisk at ``SECONDS``."""
+    given = {
+        "cases": [_basilisk_case(name) for name in CASES],
+        "hz": HZ,
+        "every": BASILISK_EVERY,
+        "seconds": SECONDS,
+        "pulses": PULSES,
+    }
+    done = subprocess.run(
+        [python, "-c", _BASILISK],
+        input=json.dumps(given),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise SystemExit(f"Basilisk failed: {done.stderr.strip()[-2000:]}")
+    flown = json.loads(done.stdout.split("RESULT")[1])
+    return {
+        name: [_led(row) | {"at_s": at} for at, row in zip(SECONDS, rows, strict=True)]
+        for name, rows in zip(CASES, flown, strict=True)
+    }
+
+
+def _led(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a row of Basilisk, half a step later."""
+    sigma, parts = np.array(row["sigma"]), {}
+    square = float(sigma @ sigma)
+    q = np.array([1.0 - square, *(2.0 * sigma)]) / (1.0 + square)
+    for name, value, rate in (
+        ("position_m", "position", "velocity"),
+        ("deflections_m", "bent", "bending"),
+    ):
+        parts[name] = (np.array(row[value]) + LEAD_S * np.array(row[rate])).tolist()
+    turned = rotations.multiply(q, rotations.exp(LEAD_S * np.array(row["omega"])))
+    return {**parts, "q_wxyz": turned.tolist()}
+
+
+def fly(physics: Physics, seconds: Sequence[int]) -> list[tuple[BodyState, Array]]:
+    """Fly a case; return state and deflections (n, 3), m, of the chaser at these times."""
+    physics.place(CHASER, START)
+    changes = sorted({step for first, last, _ in PULSES for step in (first, last)})
+    flown = []
+    for at in seconds:
+        while (step := physics.step_count) < at * HZ:
+            end = min([at * HZ, *(c for c in changes if c > step)])
+            wrenches = {
+                CHASER: np.array(wrench) for first, last, wrench in PULSES if first <= step < last
+            }
+            physics.advance(end - step, wrenches)
+        flown.append((physics.state(CHASER), physics.deflections_m(CHASER)))
+    return flown
+
+
+def apart(
+    flown: Sequence[tuple[BodyState, Array]], reference: Sequence[dict[str, Any]]
+) -> tuple[float, float, float]:
+    """Return the largest differences of position, attitude and deflection at any time.
+
+    As shares of the largest travel, of half a turn, and of the largest deflection.
+    """
+    differences = [
+        (
+            float(np.linalg.norm(state.position_m - row["position_m"])),
+            float(rotations.angle_between(state.q_wxyz, row["q_wxyz"])),
+            float(np.abs(deflections - row["deflections_m"]).max()),
+        )
+        for (state, deflections), row in zip(flown, reference, strict=True)
+    ]
+    travel = max(float(np.linalg.norm(r["position_m"] - START.position_m)) for r in reference)
+    bent = max(float(np.abs(r["deflections_m"]).max()) for r in reference)
+    position, angle, deflection = np.max(differences, axis=0).tolist()
+    return position / travel, angle / math.pi, deflection / bent
+
+
+def flexible(options: Options) -> Figures:
+    """Compare a chaser with panels and fuel on springs with Basilisk (recorded, or flown by
+    ``--basilisk``) over 100 s, on each engine: shares of travel, half a turn and the largest
+    deflection (bar: 1e-4). ``--quick``: 5 s.
+    """
+    reference: dict[str, list[dict[str, Any]]] = json.loads(REFERENCE.read_text())
+    if options.basilisk:
+        reference = fly_in_basilisk(options.basilisk)
+        if options.write:
+            REFERENCE.write_text(json.dumps(reference, indent=1) + "\n")
+    figures: Figures = {}
+    for name, rows in reference.items():
+        known = [row for row in rows if row["at_s"] <= (5 if options.quick else math.inf)]
+        for engine in ENGINES:
+            physics = Physics(scenario_of(name, engine))
+            shares = apart(fly(physics, [row["at_s"] for row in known]), known)
+            physics.close()
+            for what, share in zip(("position", "attitude", "deflection"), shares, strict=True):
+                figures[f"{name}_{engine}_{what}_share"] = share
+    if max(figures.values()) > BAR_SHARE:
+        raise BenchmarkFailed(f"differs from Basilisk by more than {BAR_SHARE:g}", figures)
+    return figures
+
+
+GROUP = Group({"flexible": flexible})

@@ -104,6 +104,10 @@ class Physics:
         """Return what bodies carry on springs, by the bodies' names."""
         return self._carried
 
+    def deflections_m(self, name: str) -> Array:
+        """Return the displacements (n, 3) of what a body carries from its places, body axes."""
+        return self._carried[name].deflections_m(self._engine.motion(self._bodies.numbers[name]))
+
     @property
     def burns_propellant(self) -> bool:
         """Whether the chasers' masses fall with their propellant; then ``burn`` has to be called.

@@ -159,7 +159,7 @@ def _basilisk_case(name: str) -> dict[str, Any]:
                 "mass": mass,
                 "place": oscillator.position_m,
                 "stiffness": (mass * omega**2).tolist(),
-                "damping": (2.0 * oscillator.damping_share * mass * omega).tolist(),
+                "damping": (2.0 * np.array(oscillator.damping_shares) * mass * omega).tolist(),
             }
         )
     q = rotations.multiply(START.q_wxyz, rotations.exp(-LEAD_S * START.omega_rad_s))

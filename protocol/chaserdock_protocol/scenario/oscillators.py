@@ -41,7 +41,9 @@ class Oscillator(Section):
         description="Frequency along each axis of the body, or one for all, Hz, while the body is "
         "held; a free one moves against it, faster."
     )
-    damping_share: Fraction = Field(default=0.005, description="Damping, as a share of critical.")
+    damping_share: Fraction | tuple[Fraction, Fraction, Fraction] = Field(
+        default=0.005, description="Damping along each axis, or one for all, as a share of critical."
+    )
     propellant: bool = Field(
         default=False,
         description="Whether thrusters consume it: its mass falls by the impulse over specific "
@@ -53,6 +55,12 @@ class Oscillator(Section):
         """Frequencies along the axes of the body."""
         f = self.frequency_hz
         return f if isinstance(f, tuple) else (f, f, f)
+
+    @property
+    def damping_shares(self) -> tuple[float, float, float]:
+        """Damping along the axes of the body."""
+        d = self.damping_share
+        return d if isinstance(d, tuple) else (d, d, d)
 
 
 def check_oscillators(scenario: Scenario) -> None:

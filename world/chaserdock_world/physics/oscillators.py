@@ -51,9 +51,9 @@ class BodyOscillators:
         # Places from the centre of mass of the rest.
         self._places_m = np.array([o.position_m for o in oscillators]) - frame.offset_m
         omega = 2.0 * math.pi * np.array([o.frequencies_hz for o in oscillators])
-        damping = np.array([o.damping_share for o in oscillators])
+        damping = np.array([o.damping_shares for o in oscillators])
         self._stiffness = omega**2  # N/m per kg
-        self._damping = 2.0 * damping[:, None] * omega  # N s/m per kg
+        self._damping = 2.0 * damping * omega  # N s/m per kg
         self._burns = np.array([o.propellant for o in oscillators])
         self._residual_kg = RESIDUAL_SHARE * float(masses_kg[self._burns].sum())
         self._positions_m = self._velocities = self._relative = np.zeros((0, 3))

@@ -13,7 +13,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.oscillators import MassProperties, frequencies_hz, rest_fault, rigid_rest
 from pydantic import Field
 
-from .fields import Fraction, Positive, Section, Vector
+from .fields import Fraction, Positive, PositiveVector, Section, Vector
 
 if TYPE_CHECKING:
     from . import Scenario
@@ -22,8 +22,6 @@ STEPS_PER_PERIOD = 30
 """Least number of physics steps in a period of the fastest oscillation, at which its frequency is
 off by 1e-5 and a step still is stable by a factor of ten.
 """
-
-Frequency = Annotated[Positive, Field(le=100)]
 
 
 class Oscillator(Section):
@@ -37,12 +35,13 @@ class Oscillator(Section):
         description="Its share of the body's mass: of a mode, its effective mass."
     )
     position_m: Vector = Field(description="Where it rests (CRF or TRF), m.")
-    frequency_hz: Frequency | tuple[Frequency, Frequency, Frequency] = Field(
+    frequency_hz: Positive | PositiveVector = Field(
         description="Frequency along each axis of the body, or one for all, Hz, while the body is "
         "held; a free one moves against it, faster."
     )
     damping_share: Fraction | tuple[Fraction, Fraction, Fraction] = Field(
-        default=0.005, description="Damping along each axis, or one for all, as a share of critical."
+        default=0.005,
+        description="Damping along each axis, or one for all, as a share of critical.",
     )
     propellant: bool = Field(
         default=False,

@@ -28,8 +28,8 @@ from .gyroscopic import midpoint_torque, midpoint_torque_of_rates, split_loads
 from .latch import ProbeLatch
 from .latching import ContactPairs, Latching
 from .moving_bodies import MovingBodies
-from .oscillators import BodyOscillators, carried_by
 from .orbital_forces import OrbitalForces
+from .oscillators import BodyOscillators, carried_by
 from .plume_loads import PlumeLoads
 from .port_loads import PortLoadRecorder
 from .target_motion import PrescribedMotion, prescribed_state
@@ -110,8 +110,7 @@ class Physics:
 
     @property
     def burns_propellant(self) -> bool:
-        """Whether the chasers' masses fall with their propellant; then ``burn`` has to be called.
-        """
+        """Whether the chasers' masses fall with their propellant; then ``burn`` has to be called."""
         return any(o.propellant for o in self._scenario.truth.oscillators("chaser"))
 
     def burn(self, name: str, thrusts_N: Array, time_s: float) -> None:

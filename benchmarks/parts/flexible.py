@@ -227,10 +227,8 @@ def fly(physics: Physics, seconds: Sequence[int]) -> list[tuple[BodyState, Array
     for at in seconds:
         while (step := physics.step_count) < at * HZ:
             end = min([at * HZ, *(c for c in changes if c > step)])
-            wrenches = {
-                CHASER: np.array(wrench) for first, last, wrench in PULSES if first <= step < last
-            }
-            physics.advance(end - step, wrenches)
+            acting = [np.array(wrench) for first, last, wrench in PULSES if first <= step < last]
+            physics.advance(end - step, {CHASER: acting[0]} if acting else {})
         flown.append((physics.state(CHASER), physics.deflections_m(CHASER)))
     return flown
 

@@ -165,7 +165,7 @@ def test_a_free_body_oscillates_faster_than_a_held_one() -> None:
     at_centre = frequencies_hz(rest, np.array([2.0]), np.array([rest.centre_m]), held)
     np.testing.assert_allclose(at_centre, held[0] * math.sqrt(1.0 + 2.0 / 8.0))
     # An arm along Y: motion along X and Z turns the body, motion along Y does not.
-    place = np.array([rest.centre_m + [0.0, 0.4, 0.0]])
+    place = np.array([rest.centre_m + (0.0, 0.4, 0.0)])
     arm2 = 2.0 * 0.4**2
     factors = np.sqrt(1.25 + np.array([arm2 / 0.7, 0.0, arm2 / 0.5]))
     found = frequencies_hz(rest, np.array([2.0]), place, held)
@@ -203,8 +203,8 @@ def test_masses_follow_the_orbit_with_their_body(engine: str) -> None:
 # -- propellant ------------------------------------------------------------------------------------
 
 
-TANK = {"mass_share": 0.3, "position_m": [0.02, 0.0, -0.01], "frequency_hz": 8.0, "propellant": True,
-        "damping_share": 0.1}  # fmt: skip
+TANK = {"mass_share": 0.3, "position_m": [0.02, 0.0, -0.01], "frequency_hz": 8.0,
+        "damping_share": 0.1, "propellant": True}  # fmt: skip
 
 
 def test_mass_falls_by_what_the_thrusters_consume() -> None:
@@ -286,5 +286,5 @@ def test_shares_that_leave_no_body_are_refused() -> None:
 def test_a_drawn_body_that_cannot_carry_them_is_refused() -> None:
     thin = {"chaser": 0, "inertia_kg_m2": [0.1, 0.1, 0.1, 0.0, 0.0, 0.0]}
     s = docking_scenario(truth={"oscillator": PAIR, "values": [thin]})
-    with pytest.raises(ScenarioError, match="truth.oscillator: chaser/0 as drawn: no body has"):
+    with pytest.raises(ScenarioError, match=r"truth.oscillator: chaser/0 as drawn: no body has"):
         Physics(s)

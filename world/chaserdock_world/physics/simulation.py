@@ -110,7 +110,7 @@ class Physics:
 
     @property
     def burns_propellant(self) -> bool:
-        """Whether the chasers' masses fall with their propellant; then ``burn`` has to be called."""
+        """Whether the chasers' masses fall with their propellant, which ``burn`` consumes."""
         return any(o.propellant for o in self._scenario.truth.oscillators("chaser"))
 
     def burn(self, name: str, thrusts_N: Array, time_s: float) -> None:

@@ -165,7 +165,7 @@ def test_a_free_body_oscillates_faster_than_a_held_one() -> None:
     at_centre = frequencies_hz(rest, np.array([2.0]), np.array([rest.centre_m]), held)
     np.testing.assert_allclose(at_centre, held[0] * math.sqrt(1.0 + 2.0 / 8.0))
     # An arm along Y: motion along X and Z turns the body, motion along Y does not.
-    place = np.array([rest.centre_m + (0.0, 0.4, 0.0)])
+    place = np.array([rest.centre_m + np.array([0.0, 0.4, 0.0])])
     arm2 = 2.0 * 0.4**2
     factors = np.sqrt(1.25 + np.array([arm2 / 0.7, 0.0, arm2 / 0.5]))
     found = frequencies_hz(rest, np.array([2.0]), place, held)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import subprocess
 from collections.abc import Sequence
 from typing import Any
@@ -140,7 +141,11 @@ print("RESULT" + json.dumps(results))
 
 def scenario_of(case: str, engine: str) -> Scenario:
     """Return the scenario of a case: the chaser of ``docking-contact``, far from its target."""
-    overrides = (f"truth.oscillator=[{CASES[case]}]", f'world.engine="{engine}"')
+    return _scenario(CASES[case], engine)
+
+
+def _scenario(carried: str, engine: str) -> Scenario:
+    overrides = (f"truth.oscillator=[{carried}]", f'world.engine="{engine}"')
     return load_scenario(shipped_scenario("docking-contact"), overrides)
 
 
@@ -254,10 +259,59 @@ def apart(
     return position / travel, angle / math.pi, deflection / bent
 
 
+def _totals(physics: Physics, held_rad_s: Array) -> tuple[Array, Array, float]:
+    """Return momentum (3,), angular momentum (3,) about WRF's origin and energy of the chaser.
+
+    With what it carries; ``held_rad_s`` (n, 3): frequencies while it is held.
+    """
+    rest, state = physics.plants[CHASER], physics.state(CHASER)
+    arm = rotations.rotate(state.q_wxyz, rest.centre_of_mass_m)
+    omega = rotations.rotate(state.q_wxyz, state.omega_rad_s)
+    velocity = state.velocity_m_s + np.cross(omega, arm)
+    spin = rest.inertia_kg_m2 @ state.omega_rad_s
+    masses, places, velocities = physics.carried[CHASER].momenta()
+    momentum = rest.mass_kg * velocity + masses @ velocities
+    angular = rest.mass_kg * np.cross(state.position_m + arm, velocity)
+    angular = angular + rotations.rotate(state.q_wxyz, spin)
+    angular = angular + (masses[:, None] * np.cross(places, velocities)).sum(axis=0)
+    stretch = held_rad_s * physics.deflections_m(CHASER)
+    energy = rest.mass_kg * velocity @ velocity + state.omega_rad_s @ spin
+    energy += masses @ (velocities**2 + stretch**2).sum(axis=1)
+    return momentum, angular, 0.5 * float(energy)
+
+
+def conserved(engine: str, seconds: int) -> Figures:
+    """Return the changes of momentum and angular momentum, and of the energy's mean over five
+    seconds, as shares, of a free chaser without damping that was set swinging.
+    """
+    carried = re.sub(r"damping_share=[0-9.]+", "damping_share=0.0", CASES["panels_and_slosh"])
+    carried = carried.replace("]}", "], damping_share=0.0}")
+    scenario = _scenario(carried, engine)
+    physics, stated = Physics(scenario), scenario.truth.oscillators("chaser")
+    held = 2.0 * math.pi * np.array([o.frequencies_hz for o in stated])
+    physics.place(CHASER, START)
+    physics.advance(HZ // 2, {CHASER: np.array(PULSES[0][2])})
+    rows = [_totals(physics, held)]
+    for _ in range(20 * seconds):
+        physics.advance(HZ // 20, {})
+        rows.append(_totals(physics, held))
+    physics.close()
+    (first, first_angular, _), (last, last_angular, _) = rows[0], rows[-1]
+    energies = np.array([row[2] for row in rows])
+    return {
+        f"{engine}_momentum_share": float(np.linalg.norm(last - first) / np.linalg.norm(first)),
+        f"{engine}_angular_momentum_share": float(
+            np.linalg.norm(last_angular - first_angular) / np.linalg.norm(first_angular)
+        ),
+        f"{engine}_energy_share": float(energies[-100:].mean() / energies[:100].mean() - 1.0),
+    }
+
+
 def flexible(options: Options) -> Figures:
     """Compare a chaser with panels and fuel on springs with Basilisk (recorded, or flown by
     ``--basilisk``) over 100 s, on each engine: shares of travel, half a turn and the largest
-    deflection (bar: 1e-4). ``--quick``: 5 s.
+    deflection (bar: 1e-4). Then, without damping, what should be conserved. ``--quick``: 5 and
+    10 s.
     """
     reference: dict[str, list[dict[str, Any]]] = json.loads(REFERENCE.read_text())
     if options.basilisk:
@@ -273,6 +327,8 @@ def flexible(options: Options) -> Figures:
             physics.close()
             for what, share in zip(("position", "attitude", "deflection"), shares, strict=True):
                 figures[f"{name}_{engine}_{what}_share"] = share
+    for engine in ENGINES:
+        figures |= conserved(engine, 10 if options.quick else 100)
     if max(figures.values()) > BAR_SHARE:
         raise BenchmarkFailed(f"differs from Basilisk by more than {BAR_SHARE:g}", figures)
     return figures

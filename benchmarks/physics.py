@@ -2,15 +2,17 @@
 """The simulated physics: ``python benchmarks/physics.py [--only PART ...]``.
 
 The engines PyBullet and MuJoCo against each other, for 30 s (``--quick``: 5 s) in open loop and in
-missions, relative orbital motion against Basilisk, and the speed of the training environments.
+missions, relative orbital motion and bodies that are not rigid against Basilisk, and the speed of
+the training environments.
 """
 
 from common import main
-from parts import engines, environments, relative_orbit
+from parts import engines, environments, flexible, relative_orbit
 
 GROUPS = (
     engines.GROUP,
     relative_orbit.GROUP,
+    flexible.GROUP,
     environments.GROUP,
 )
 

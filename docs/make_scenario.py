@@ -14,6 +14,7 @@ from chaserdock_protocol.scenario.json_schema import (
     SchemaNode,
     description_of,
     item_of,
+    options_of,
     range_text,
     resolved,
     schema_of,
@@ -83,6 +84,8 @@ def type_of(node: SchemaNode, root: SchemaNode) -> str:
         return " or ".join(f"`{value}`" for value in node["enum"])
     if "const" in node:
         return f"`{node['const']}`"
+    if "anyOf" in node:
+        return " or ".join(type_of(option, root) for option in options_of(node, root))
     kind = node.get("type")
     if kind == "array":
         item = resolved(item_of(node) or {}, root)
@@ -101,6 +104,8 @@ def type_of(node: SchemaNode, root: SchemaNode) -> str:
 
 def range_of(node: SchemaNode, root: SchemaNode) -> str:
     """Return the range of a number, of an array's numbers, or of an array's length."""
+    if "anyOf" in node:
+        return range_of(options_of(node, root)[0], root)
     if node.get("type") != "array":
         return range_text(node)
     low, high = node.get("minItems"), node.get("maxItems")

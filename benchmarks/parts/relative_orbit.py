@@ -167,7 +167,8 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--basilisk",
         metavar="PYTHON",
-        help="of orbit: interpreter of an environment of its own, in which bsk is installed",
+        help="of orbit and flexible: interpreter of an environment of its own, in which bsk is "
+        "installed",
     )
     parser.add_argument(
         "--write", action="store_true", help="record Basilisk's results for the tests"

@@ -232,6 +232,7 @@ def _check_supported(scenario: Scenario) -> None:
         "chaser.degrees_of_freedom: planar": chaser.is_planar,
         "time.latency_s longer than a tick": timing.latency_steps > timing.steps_per_tick,
         "thruster_failure": bool(scenario.thruster_failure),
+        "truth.oscillator": bool(truth.oscillator),
         **{
             f"truth.chaser.{key}": bool(getattr(mismatch, key))
             for key in ("pulse_scatter_share", "force_noise_N", "torque_noise_N_m", "delay_s",

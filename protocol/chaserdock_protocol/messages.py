@@ -308,7 +308,7 @@ class BodyTruth(Message, frozen=True, kw_only=True):
     ``impulse_N_s`` and ``angular_impulse_N_m_s``: impulses of its actuators since the last tick, in
     body axes. ``absolute_impulse_N_s``: time integral of the sum of the force components'
     magnitudes. With thrusters, since the last tick: ``thruster_impulse_N_s`` and valve opening time
-    ``thruster_open_s`` of each, and ``propellant_kg`` used (the body's mass is constant).
+    ``thruster_open_s`` of each, and ``propellant_kg`` used.
     """
 
     body: Text

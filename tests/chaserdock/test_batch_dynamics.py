@@ -582,6 +582,8 @@ def test_a_docked_chaser_moves_with_the_target_and_a_failure_ends_the_episode_of
           "target.omega_rad_s=[0.0, 0.0, 0.0]"], "do not simulate orbit"),
         (["time.latency_s=0.5"], "time.latency_s longer than a tick"),
         (["truth.chaser.delay_s=0.01"], "truth.chaser.delay_s"),
+        (["truth.oscillator=[{mass_share=0.1, position_m=[0.0, 0.0, 0.0], frequency_hz=1.0}]"],
+         "truth.oscillator"),
         (["time.rate_hz=96", "time.image_hz=96", "chaser.modulation.carrier_hz=10",
           "time.latency_s=0.0"],
          "chaser.thrusters.0: a minimum on-time of 0.01 s and a fall"),

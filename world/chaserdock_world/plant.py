@@ -180,7 +180,7 @@ def draw_moments(nominal: Moments, share: float, rng: np.random.Generator) -> Mo
     return nominal
 
 
-def _principal(inertia: Array) -> tuple[Moments, Array]:
+def principal_axes(inertia: Array) -> tuple[Moments, Array]:
     """Return principal moments of an inertia tensor (3, 3), and rotation (4,) principal to body
     axes.
     """
@@ -216,7 +216,7 @@ def _plant(
     if explicit is not None:
         mass = explicit.mass_kg or mass
         if explicit.inertia is not None:
-            moments, q = _principal(explicit.inertia)
+            moments, q = principal_axes(explicit.inertia)
         if explicit.centre_of_mass_m is not None:
             offset = np.array(explicit.centre_of_mass_m)
         if explicit.force_N is not None:
@@ -243,7 +243,7 @@ def target_plant(scenario: Scenario) -> Plant:
     moments, axes = target.moments, None
     tensor = target.inertia_tensor
     if np.any(tensor[~np.eye(3, dtype=bool)]):
-        moments, axes = _principal(tensor)
+        moments, axes = principal_axes(tensor)
     place = np.array(target.centre_of_mass_m)
     return _plant(scenario.seed, TARGET_KEY, target.mass_kg, moments, sigma, explicit, axes, place)
 

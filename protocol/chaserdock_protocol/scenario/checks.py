@@ -31,6 +31,7 @@ from numpy.typing import ArrayLike
 from .bodies import FlightTarget
 from .faults import check_faults
 from .mounting import nominal_mounting, plume_free_thrusters
+from .oscillators import check_oscillators
 from .planar import check_planar, check_planar_flight, up_in_target
 from .schema import MARKER_PERCEPTIONS
 from .thrusters import check_pulses, thrusts_max
@@ -110,6 +111,7 @@ def check_consistent(scenario: Scenario) -> None:
     _check_stopping_time(scenario)
     check_faults(scenario.fault, scenario)
     _check_truth(scenario)
+    check_oscillators(scenario)
 
 
 def _check_start_positions(scenario: Scenario) -> None:

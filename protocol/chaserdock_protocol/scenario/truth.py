@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from .fields import Index, Number, Positive, Section, Vector
 from .navigation import Degrees, Duration, FocalShare, Metres, OffsetPixels
+from .oscillators import Oscillator
 
 MismatchShare = Annotated[float, Field(ge=0, le=0.3, allow_inf_nan=False)]
 Offset = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
@@ -286,6 +287,7 @@ class TruthSection(Section):
     sensors: SensorTruth = SensorTruth()
     latch: LatchTruth = LatchTruth()
     values: tuple[TruthValues, ...] = ()
+    oscillator: tuple[Oscillator, ...] = ()
 
     def mismatch(self, body: Literal["chaser", "target"]) -> Mismatch:
         """Return the figures of the chasers or of the target."""
@@ -303,3 +305,7 @@ class TruthSection(Section):
     def values_of(self, chaser: int | None) -> TruthValues | None:
         """Return the explicit values of a chaser, or of the target for None."""
         return next((v for v in self.values if v.chaser == chaser), None)
+
+    def oscillators(self, body: Literal["chaser", "target"]) -> tuple[Oscillator, ...]:
+        """Return what each chaser, or the target, carries on springs."""
+        return tuple(o for o in self.oscillator if o.body == body)

@@ -184,5 +184,8 @@ def fly_to(
             thrusts = {name: a.thrusts(step) for name, a in actuators.items()}
             for name, load in physics.plumes.act(states, thrusts, steps * step_s).items():
                 wrenches[name] = wrenches[name] + load if name in wrenches else load
+        if physics.burns_propellant:
+            for name, a in actuators.items():
+                physics.burn(name, a.thrusts(step), steps * step_s)
         touched |= physics.advance(steps, wrenches)
     return touched

@@ -2,7 +2,7 @@
 """Simulate a chaser's thrusters: valves that open and close as commanded, with failures.
 
 The wrench about the centre of mass is constant in body axes over a physics step and equals the mean
-over the step. Propellant consumption is computed; the body's mass stays constant.
+over the step.
 """
 
 from __future__ import annotations

@@ -7,9 +7,12 @@ The interface is in body frames with body rates. The forces of an orbit are appl
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState
+from chaserdock_models.thruster_model import G0_M_S2
 from chaserdock_protocol.messages import Latch
 from chaserdock_protocol.scenario import Scenario
 
@@ -26,12 +29,15 @@ from .latch import ProbeLatch
 from .latching import ContactPairs, Latching
 from .moving_bodies import MovingBodies
 from .orbital_forces import OrbitalForces
+from .oscillators import BodyOscillators, carried_by
 from .plume_loads import PlumeLoads
 from .port_loads import PortLoadRecorder
 from .target_motion import PrescribedMotion, prescribed_state
 
 _ZERO = (0.0, 0.0, 0.0)  # N or N m
 _NO_WRENCH = np.zeros(6)
+_KEYS_OF_BODY = 1000
+"""Distance of the keys of what bodies carry, above the numbers of the bodies."""
 
 
 class Physics:
@@ -47,6 +53,7 @@ class Physics:
         self.plants = {TARGET: target_plant(scenario)} | chasers
         if scenario.chaser.is_planar:
             self.plants = on_floor(scenario, self.plants)
+        self.plants, self._carried = carried_by(scenario, self.plants)
         setup = engine_setup(scenario, self.plants)
         self._engine = make_engine(scenario.world.engine, setup)
         prescribed = PrescribedMotion(scenario) if scenario.target.motion != "torque_free" else None
@@ -66,6 +73,8 @@ class Physics:
             self._orbital = OrbitalForces(
                 TargetOrbit(scenario.orbit), setup.step_s, scenario.timing.steps_per_tick
             )
+        for name, carried in self._carried.items():
+            carried.settle(self._engine.motion(self._bodies.numbers[name]))
         self.plumes = None if scenario.plume is None else PlumeLoads(scenario, scenario.plume)
 
     # -- bodies ------------------------------------------------------------------------------------
@@ -87,6 +96,27 @@ class Physics:
     def place(self, name: str, state: BodyState) -> None:
         """Set the state of a body. Contacts are not checked."""
         self._bodies.place(name, state)
+        if name in self._carried:
+            self._carried[name].settle(self._engine.motion(self._bodies.numbers[name]))
+
+    @property
+    def carried(self) -> Mapping[str, BodyOscillators]:
+        """Return what bodies carry on springs, by the bodies' names."""
+        return self._carried
+
+    def deflections_m(self, name: str) -> Array:
+        """Return the displacements (n, 3) of what a body carries from its places, body axes."""
+        return self._carried[name].deflections_m(self._engine.motion(self._bodies.numbers[name]))
+
+    @property
+    def burns_propellant(self) -> bool:
+        """Whether the chasers' masses fall with their propellant, which ``burn`` consumes."""
+        return any(o.propellant for o in self._scenario.truth.oscillators("chaser"))
+
+    def burn(self, name: str, thrusts_N: Array, time_s: float) -> None:
+        """Consume the propellant of a chaser's thrusters with these thrusts (n,) for a time."""
+        exhaust_m_s = [t.isp_s * G0_M_S2 for t in self._scenario.chaser.thrusters]
+        self._carried[name].burn(float(np.sum(thrusts_N / exhaust_m_s)) * time_s)
 
     # -- latches -----------------------------------------------------------------------------------
 
@@ -151,7 +181,7 @@ class Physics:
             self._loads[k, 3:] = self.plants[name].wrench_in_engine(wrench)
         if self._floor is not None:
             self._floor.carry(self._loads[:, 3:])
-        if self.latches or self._orbital is not None:
+        if self.latches or self._orbital is not None or self._carried:
             return self._advance_by_step(steps)
         bodies = self._bodies
         touched: set[tuple[str, str]] = set()
@@ -178,10 +208,13 @@ class Physics:
         touched: set[tuple[str, str]] = set()
         engine, bodies, latching = self._engine, self._bodies, self._latching
         motion_of, push, before = engine.motion, engine.push, bodies.before
+        carried = {bodies.numbers[name] for name in self._carried}
         for _ in range(steps):
             jointed = latching.begin_step()
             for body, inertia, force, torque in loads:
                 motion = motion_of(body)
+                if body in carried:
+                    force, torque = self._with_carried(body, motion, force, torque)
                 if body in jointed:
                     last = before.get(body, motion)
                     x, y, z = midpoint_torque_of_rates(inertia, motion[1], motion[3], last[3])
@@ -203,6 +236,25 @@ class Physics:
             if self._floor is not None and (touching or jointed):
                 self._floor.hold()
         return touched
+
+    def _with_carried(
+        self, body: int, motion: BodyMotion, force: list[float], torque: list[float]
+    ) -> tuple[list[float], list[float]]:
+        """Move what a body carries by one step; return the loads with what that exerts on it."""
+        carried = self._carried[self.bodies[body]]
+        others = None if self._orbital is None else self._orbital_on(carried, body, self._orbital)
+        added_force, added_torque = carried.step(motion, others)
+        return (added_force + force).tolist(), (added_torque + torque).tolist()
+
+    def _orbital_on(self, carried: BodyOscillators, body: int, orbital: OrbitalForces) -> Array:
+        """Return the loads of the orbit (n, 3) on what a body carries."""
+        orbital.set_step(self.step_count)
+        first = (body + 1) * _KEYS_OF_BODY
+        has_drag = self.bodies[body] != TARGET
+        rows = zip(*(part.tolist() for part in carried.momenta()), strict=True)
+        return np.array(
+            [orbital.force(first + k, m, x, v, has_drag) for k, (m, x, v) in enumerate(rows)]
+        )
 
     def _apply_orbital(self, orbital: OrbitalForces, body: int, motion: BodyMotion) -> None:
         """Apply the loads of the orbit to a body for one step."""

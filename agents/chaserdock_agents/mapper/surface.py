@@ -10,6 +10,7 @@ faces are marked, and stand for what may be behind them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
@@ -28,6 +29,9 @@ _DEPTH_M = 0.005
 _GRAZING = 0.17
 """Cosine of the angle between a face's normal and a line of sight up to which its vertices count as
 seen from outside: 80 degrees."""
+MOST_SIGHTS = 6
+"""Lines of sight of each landmark, spread over the flight: three landmarks must have one through a
+place to make it empty, and each costs a test of all faces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,18 @@ class SightLines:
 
     landmarks: IntArray
     cameras_m: Array
+
+    def thinned(self, most: int = MOST_SIGHTS) -> SightLines:
+        """Return at most so many lines of sight of each landmark, spread over their order."""
+        order = np.argsort(self.landmarks, kind="stable")
+        counts = np.bincount(self.landmarks)
+        counts = counts[counts > 0]
+        chosen = [
+            start + np.unique(np.linspace(0, count - 1, most).astype(int))
+            for start, count in zip(np.cumsum(counts) - counts, counts, strict=True)
+        ]
+        kept = order[np.concatenate([np.zeros(0, dtype=np.int64), *chosen])]
+        return SightLines(self.landmarks[kept], self.cameras_m[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +72,15 @@ class MappedSurface:
         a, b, c = (self.vertices_m[self.triangles[:, k]] for k in range(3))
         normals = np.cross(b - a, c - a)
         return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+    @cached_property
+    def dense_m(self) -> Array:
+        """Vertices, middles of edges and of triangles, and points between (k, 3): long triangles
+        have no vertex near a place that they cross.
+        """
+        corners = self.vertices_m[self.triangles]
+        shares = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4.0
+        return np.einsum("sk,tkd->tsd", shares, corners).reshape(-1, 3)
 
     def volume_m3(self) -> float:
         """Return the enclosed volume."""

@@ -179,7 +179,8 @@ class StackRest(Struct, frozen=True, kw_only=True):
 
 class MappingFigures(Struct, frozen=True, kw_only=True):
     """What the maps of a target of unknown shape show: status at the end, number of maps, time of
-    the first one, and figures of the last one. None without a map, or without ground truth.
+    the first one, figures of the last one, and time of the first one whose loop has closed. None
+    without a map, or without ground truth.
     """
 
     status: str
@@ -190,6 +191,7 @@ class MappingFigures(Struct, frozen=True, kw_only=True):
     scale_sigma_share: float | None
     landmarks: int
     residual_px: float | None
+    closed_s: float | None = None
 
 
 class Latency(Struct, frozen=True, kw_only=True):

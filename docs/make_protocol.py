@@ -41,6 +41,7 @@ _QUERIES = (
     (topics.JOIN_KEY, messages.JoinRequest, messages.JoinReply),
     (topics.SCENARIO_KEY, messages.ScenarioRequest, messages.ScenarioReply),
     (topics.OPERATE_KEY, messages.OperatorCommand, messages.CommandReply),
+    (topics.PORT_KEY, messages.PortRequest, messages.CommandReply),
     (topics.THRUSTER_FAULT_KEY, messages.ThrusterFaultCommand, messages.CommandReply),
     (topics.ARMING_KEY, messages.ArmingCommand, messages.ArmingReply),
 )

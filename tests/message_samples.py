@@ -13,6 +13,10 @@ EYE6 = tuple(1.0 if i % 7 == 0 else 0.0 for i in range(36))
 V, Q = (0.25, -1.5, 3.0), (0.5, -0.5, 0.5, -0.5)
 HEAD: dict[str, Any] = {"seq": 7, "tick": 12, "sim_time_ns": 800_000_000}
 SOLUTION = m.PoseSolution(position_m=V, q_wxyz=Q, covariance=EYE6, reprojection_rms_px=0.125)
+PORT = m.ChosenPort(
+    chaser=1, number=2, position_m=V, axis=(0.6, 0.0, -0.8),
+    axis_sigma_rad=0.01, flatness_m=0.002, clearance_m=0.25,
+)  # fmt: skip
 MASS = m.MassEstimate(
     mass_kg=150.5,
     centre_of_mass_m=V,
@@ -70,6 +74,8 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         scale_share=0.0025,
         residual_px=0.375,
         merges=4,
+        closed=True,
+        ports=(PORT,),
     ),
     m.Odometry(**HEAD, chaser=255, position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
     m.DockingStatus(**HEAD, chaser=1, contact=True, armed=True, latched=False),
@@ -130,6 +136,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
             position_covariance_m2=(1e-8, 0.0, 0.0, 0.0, 1e-8, 0.0, 0.0, 0.0, 1e-6),
         ),
         acquiring=True,
+        map=m.SightedMap(closed=True, port=PORT),
         wall_estimate_s=0.01,
     ),
     m.TargetEstimate(
@@ -251,6 +258,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.Health(**HEAD, process="chaser/0", rejected={"world/tick:format": 2}, lost=1, stale=0),
     m.RecorderAck(**HEAD),
     m.ThrusterFaultCommand(chaser=1, thruster=3, kind="weak", factor=0.5, operator="me"),
+    m.PortRequest(chaser=1, image=0, pixel=(512.5, 270.25), operator="me"),
     m.ArmingCommand(action="arm", operator="me"),
     m.ArmingReply(accepted=True, reason="armed by me"),
     m.Kill(**HEAD, by="a button"),

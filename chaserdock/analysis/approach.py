@@ -10,6 +10,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 
 from .flight import RecordedFlight
+from .mapping import ports_at
 
 _BEYOND_ENTRY = 1.3
 """Largest range shown, in lengths of the corridor: with the end of the alignment before it. Larger:
@@ -56,6 +57,7 @@ def approach_of(flight: RecordedFlight, chaser: int) -> DockingApproach | None:
         if phase in _APPROACHING
     ]
     own, target = flight.motion.pair(chaser)
+    target = flight.estimated_frame(target)
     times = target.time_s
     inside = np.any([(times >= a) & (times < b) for a, b in spans or [(1.0, 0.0)]], axis=0)
     if np.count_nonzero(inside) < 3:
@@ -64,6 +66,9 @@ def approach_of(flight: RecordedFlight, chaser: int) -> DockingApproach | None:
     if port is None:
         place = np.array(s.chasers[chaser].position_m)
         axis, origin = place / np.linalg.norm(place), np.zeros(3)
+        chosen = ports_at(flight.maps, s.mapping.latency_s, chaser, times[-1:])
+        if chosen[1].any():
+            (origin,), (axis,) = chosen
         start_m, ahead = s.approach.dock_distance_m, np.zeros(3)
         furthest = np.inf
         lateral = (Limit(0.0, 0.0, s.approach.docked_position_m, "docked"),)

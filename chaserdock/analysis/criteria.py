@@ -118,9 +118,11 @@ def _loads(result: dict[str, Any], s: Scenario) -> Iterator[Criterion]:
 
 def nearest_allowed_m(s: Scenario, chaser: int) -> float:
     """Return the smallest allowed distance of a chaser from the target's centre. With a port it is
-    smaller.
+    smaller; with one chosen in flight, on a face turned away from the centre, that to the port.
     """
     port, limit = s.docking.port_of(chaser), s.limits.min_distance_target_m
+    if s.chooses_port(chaser):
+        return min(limit, s.approach.dock_distance_m - s.approach.docked_position_m)
     if port is None:
         return limit
     latched_m = float(np.linalg.norm(centre_offset(port, s.chaser.probe_reach_m, 0.0)))

@@ -508,7 +508,7 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
                 (begin_s, end_s), (limit * 1e3,) * 2, color=colour(i), linestyle=":", linewidth=1.3
             )
             fastest = max(fastest, limit * 1e3)
-    if any(_docks_at_distance(flight, i) for i in numbers):
+    if any(_docks_at_distance(flight, i) and not s.chooses_port(i) for i in numbers):
         label = f"docking distance {s.approach.dock_distance_m:g} m"
         limit_line(top, s.approach.dock_distance_m, label, at="left")
     top.set(ylabel="distance to the target / m", ylim=(nearest * 0.5, None))

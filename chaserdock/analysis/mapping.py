@@ -62,6 +62,24 @@ _ROUNDS = 5
 """Repetitions of the mean of rotations, which are within some degrees of each other."""
 
 
+def ports_at(
+    maps: list[LandmarkMap], latency_s: float, chaser: int, time_s: Array
+) -> tuple[Array, Array]:
+    """Return positions and axes (K, 3), frame of the map, of a chaser's chosen port at times (K,),
+    by the maps that count then; zero before it has one.
+    """
+    found = [
+        (m.sim_time_ns / 1e9 + latency_s, p) for m in maps for p in m.ports if p.chaser == chaser
+    ]
+    places = np.array([np.zeros((2, 3)), *((p.position_m, p.axis) for _, p in found)])
+    rows = np.searchsorted([at_s for at_s, _ in found], time_s + _SAME_S, side="right")
+    return places[rows, 0], places[rows, 1]
+
+
+_SAME_S = 1e-6
+"""Difference of two times, s, that are the same but for rounding."""
+
+
 def mapping_of(maps: list[LandmarkMap], target: Track | None) -> dict[str, Any] | None:
     """Return what a flight's maps show, as plain values for JSON; None in a flight without any.
 
@@ -80,6 +98,7 @@ def mapping_of(maps: list[LandmarkMap], target: Track | None) -> dict[str, Any] 
         "scale_sigma_share": None if last is None else last[0].scale_share,
         "landmarks": 0 if last is None else len(last[0].landmarks_m) // 3,
         "residual_px": None if last is None else last[0].residual_px,
+        "closed_s": next((m.sim_time_ns / 1e9 for m in maps if m.closed), None),
     }
 
 

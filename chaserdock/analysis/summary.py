@@ -37,7 +37,7 @@ from .flight import (
     SightingUse,
     load_flight,
 )
-from .mapping import mapping_of, mapping_text
+from .mapping import mapping_of, mapping_text, ports_at
 from .motion import TARGET, Track
 from .pose_errors import (
     Verticals,
@@ -106,8 +106,14 @@ def true_reference(
     positions = target.position_m[rows] + rotations.rotate(target.q_wxyz[rows], offsets)
     q_off = np.array(c.q_wxyz)
     if flight.scenario.approach.face_target:
-        q_off = facing_attitudes(c.position_m, q_off, offsets)
+        base = ports_at(flight.maps, _latency_s(flight), chaser, target.time_s[rows])[0]
+        q_off = facing_attitudes(c.position_m, q_off, offsets - base)
     return positions, rotations.multiply(target.q_wxyz[rows], q_off)
+
+
+def _latency_s(flight: RecordedFlight) -> float:
+    """Return the age at which a map of an unknown target counts, s."""
+    return flight.scenario.mapping.latency_s
 
 
 def commanded_offsets(flight: RecordedFlight, chaser: int, before: Array, time_s: Array) -> Array:
@@ -287,13 +293,21 @@ def dock_time(flight: RecordedFlight, chaser: int) -> float | None:
     """Return the time (s) since which a chaser stays within the docking tolerances; None if it is
     not docked.
 
-    Docked: the reference is at the docking distance, and at the end the chaser has been within the
+    Docked: the reference is at the docking distance from the target's centre, or before the chosen
+    port of an unknown target, and at the end the chaser has been within the
     scenario's position and angle tolerances of it for at least ``docked_time_s``.
     """
     approach = flight.scenario.approach
     time_s, position, angle = tracking_errors(flight, chaser)
-    away = np.linalg.norm(commanded_offsets(flight, chaser, np.full(3, math.inf), time_s), axis=1)
-    reached = np.abs(away - approach.dock_distance_m) < 1e-6
+    offsets = commanded_offsets(flight, chaser, np.full(3, math.inf), time_s)
+    at, axis = ports_at(flight.maps, _latency_s(flight), chaser, time_s)
+    if axis.any():
+        docked = at + approach.dock_distance_m * axis
+        missing = np.linalg.norm(offsets - docked, axis=1)
+        reached = axis.any(axis=1) & (missing < approach.docked_position_m)
+    else:
+        away = np.linalg.norm(offsets, axis=1)
+        reached = np.abs(away - approach.dock_distance_m) < 1e-6
     limit = math.radians(approach.docked_angle_deg)
     inside = reached & (position <= approach.docked_position_m) & (angle <= limit)
     if not len(inside) or not inside[-1]:

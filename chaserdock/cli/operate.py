@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 class CommandName(StrEnum):
-    """Operator commands to a chaser, one to its simulated hardware, and three to all robots of a
-    gateway.
+    """Operator commands to a chaser, one to the mapper, one to simulated hardware, and three to all
+    robots of a gateway.
     """
 
     approach = "approach"
@@ -41,10 +41,17 @@ class CommandName(StrEnum):
     detumble = "detumble"
     isolate = "isolate"
     restore = "restore"
+    port = "port"
     thruster_fault = "thruster-fault"
     arm = "arm"
     disarm = "disarm"
     kill = "kill"
+
+
+class PortSearch(StrEnum):
+    """What a port can be found by."""
+
+    flat = "flat"
 
 
 class ThrusterFaultKind(StrEnum):
@@ -66,7 +73,10 @@ def command(
     ] = None,
     offset: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(metavar="X Y Z", help="goto: position in the target's frame, metres"),
+        typer.Option(
+            metavar="X Y Z",
+            help="goto: position in the target's frame, metres; default: before the chosen port",
+        ),
     ] = None,
     thruster: Annotated[
         int | None,
@@ -81,6 +91,25 @@ def command(
     factor: Annotated[
         float | None,
         typer.Option(min=0.0, max=1.0, help="thruster-fault, weak: fraction of the nominal thrust"),
+    ] = None,
+    image: Annotated[
+        str | None,
+        typer.Option(
+            metavar="chaser/N",
+            help="port: chaser in whose newest image --pixel is",
+            show_default=False,
+        ),
+    ] = None,
+    pixel: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="X Y", help="port: place in the image, pixels"),
+    ] = None,
+    point: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="port: place in the map's frame, metres"),
+    ] = None,
+    find: Annotated[
+        PortSearch | None, typer.Option(help="port: choose the best place of this kind")
     ] = None,
     operator: OperatorOpt = "",
     before: Annotated[
@@ -98,12 +127,20 @@ def command(
     reply.
 
     thruster-fault injects a failure of which the chaser is not informed; the scenario must allow it
-    with chaser.thruster_faults_by_command. arm, disarm and kill concern all robots of a gateway.
+    with chaser.thruster_faults_by_command. port chooses where on a target of unknown shape the
+    chaser docks. arm, disarm and kill concern all robots of a gateway.
     """
-    from chaserdock.launch.operator import send_arming, send_command, send_thruster_fault
+    from chaserdock_protocol.messages import PortRequest
+
+    from chaserdock.launch.operator import (
+        send_arming,
+        send_command,
+        send_port_request,
+        send_thruster_fault,
+    )
 
     if what.value in ("arm", "disarm", "kill"):
-        others = ("number", "offset", "thruster", "fault", "factor", "before")
+        others = ("number", "offset", "thruster", "fault", "factor", "before", *_PORT_OPTIONS)
         refuse_options(context, others, f"not with {what.value}")
         done = send_arming(link.link(timeout_s=timeout), what.value, timeout, operator)
         value = {"accepted": done.accepted, "reason": done.reason}
@@ -112,7 +149,21 @@ def command(
         raise typer.Exit(0 if done.accepted else 1)
     if number is None:
         raise fail(f"{what.value}: needs the number of a chaser")
-    if what is CommandName.thruster_fault:
+    if what is not CommandName.port:
+        refuse_options(context, _PORT_OPTIONS, "only with port")
+    if what is CommandName.port:
+        others = ("offset", "thruster", "fault", "factor", "before")
+        refuse_options(context, others, "not with port")
+        request = PortRequest(
+            chaser=number,
+            image=None if image is None else _number_of(image),
+            pixel=pixel,
+            point_m=point,
+            find=None if find is None else find.value,
+            operator=operator,
+        )
+        reply = send_port_request(link.link(timeout_s=timeout), request, timeout)
+    elif what is CommandName.thruster_fault:
         refuse_options(context, ("offset", "before"), "not with thruster-fault")
         if thruster is None or fault is None:
             raise fail("thruster-fault: needs --thruster and --fault")
@@ -132,6 +183,17 @@ def command(
             before,
         )
     _print_reply(reply, as_json)
+
+
+_PORT_OPTIONS = ("image", "pixel", "point", "find")
+
+
+def _number_of(image: str) -> int:
+    """Return the number of the chaser that an image is named by."""
+    head, _, number = image.partition("/")
+    if head != "chaser" or not number.isascii() or not number.isdigit() or int(number) > 255:
+        raise fail(f"--image: {image!r} is not chaser/N, with N from 0 to 255")
+    return int(number)
 
 
 def _print_reply(reply: CommandReply, as_json: bool) -> None:

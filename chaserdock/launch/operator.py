@@ -12,13 +12,22 @@ from chaserdock_protocol.messages import (
     ArmingReply,
     CommandReply,
     OperatorCommand,
+    PortRequest,
     ThrusterFaultCommand,
     ThrusterState,
 )
 from chaserdock_protocol.transport import Link, Node
 from msgspec import Struct
 
-from .reach import TO_ARM, TO_COMMAND, TO_INJECT_FAULTS, Rights, check_rights, why_silent
+from .reach import (
+    TO_ARM,
+    TO_CHOOSE_PORTS,
+    TO_COMMAND,
+    TO_INJECT_FAULTS,
+    Rights,
+    check_rights,
+    why_silent,
+)
 
 
 class OperatorError(ChaserdockError):
@@ -40,8 +49,8 @@ def send_command(
     ``before_s``: simulated time after which the controller refuses it. Raises OperatorError without
     a reply within ``timeout_s``, RightsError, TransportError.
     """
-    if (command == "goto") != (offset_m is not None):
-        raise OperatorError("--offset X Y Z: required by goto, and by no other command")
+    if command != "goto" and offset_m is not None:
+        raise OperatorError("--offset X Y Z: with goto only")
     if (command in ("isolate", "restore")) != (thruster is not None):
         raise OperatorError(
             "--thruster N: required by isolate and restore, and by no other command"
@@ -55,6 +64,21 @@ def send_command(
         expires_ns=None if before_s is None else round(before_s * 1e9),
     )
     return _request(link, TO_COMMAND, command, request, timeout_s, "controller", CommandReply)
+
+
+def send_port_request(link: Link, request: PortRequest, timeout_s: float) -> CommandReply:
+    """Let the mapper judge a place on an unknown target and return its reply. Raises OperatorError
+    for a request that does not say where in one way, or without a reply; RightsError,
+    TransportError.
+    """
+    wanted = [request.pixel, request.point_m, request.find]
+    if sum(w is not None for w in wanted) != 1 or (request.image is None) != (
+        request.pixel is None
+    ):
+        raise OperatorError(
+            "port: needs either --image and --pixel X Y, or --point X Y Z, or --find"
+        )
+    return _request(link, TO_CHOOSE_PORTS, "port", request, timeout_s, "mapper", CommandReply)
 
 
 def send_thruster_fault(

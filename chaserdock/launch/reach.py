@@ -56,6 +56,7 @@ STATUS_TOPICS = (
 )
 """Topics that ``chaserdock status`` reads."""
 TO_COMMAND = Rights((topics.OPERATE_KEY,))
+TO_CHOOSE_PORTS = Rights((topics.PORT_KEY,))
 TO_INJECT_FAULTS = Rights((topics.THRUSTER_FAULT_KEY,))
 TO_ARM = Rights((topics.ARMING_KEY,))
 TO_OBSERVE = Rights((topics.JOIN_KEY,), STATUS_TOPICS)

@@ -89,6 +89,7 @@ class MissionStatus:
             "ended": self.ended.reason if self.ended else None,
             "target": self.target.status if self.target else None,
             "map": self.map.status if self.map else None,
+            "map_closed": self.map.closed if self.map else None,
             "processes": {
                 name: {
                     "instance": self.presence[name].instance if name in self.presence else None,
@@ -165,6 +166,8 @@ def table_of(status: MissionStatus) -> Table:
         head += f"; target: {status.target.status}"
     if status.map is not None:
         head += f"; map: {status.map.status}"
+        if status.map.motion is not None:
+            head += ", loop closed" if status.map.closed else ", loop open"
     if status.ended is not None:
         head += f"; ended: {status.ended.reason}"
     table = Table(title=head)

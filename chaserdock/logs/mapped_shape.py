@@ -18,9 +18,6 @@ from chaserdock_protocol.recording.log import LogError, LogSource
 from .reader import open_log
 
 FILE = "target.glb"
-_SIGHTS = 6
-"""Lines of sight of each landmark, spread over the flight: three landmarks must have one through a
-place to make it empty, and each costs a test of all faces."""
 _SEEN, _UNSEEN = (190, 190, 190, 255), (200, 70, 60, 255)
 """Colours of faces that were seen from outside, and of others: grey and red."""
 
@@ -80,7 +77,7 @@ def _covariances(message: LandmarkMap) -> Array:
 
 
 def _sights(message: LandmarkMap, images: list[FeatureTracks]) -> SightLines:
-    """Return lines of sight to each landmark: at most ``_SIGHTS``, spread over the images."""
+    """Return lines of sight to each landmark: at most ``MOST_SIGHTS``, spread over the images."""
     known = {t.chaser: (np.array(t.ids), np.array(t.landmarks)) for t in message.tracks}
     numbers, cameras = [], []
     for image in images:
@@ -92,19 +89,7 @@ def _sights(message: LandmarkMap, images: list[FeatureTracks]) -> SightLines:
         cameras.append(np.tile(_camera_in_target(message, image), (len(found), 1)))
     if not numbers:
         return SightLines(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-    all_numbers, all_cameras = np.concatenate(numbers), np.concatenate(cameras)
-    order = np.argsort(all_numbers, kind="stable")
-    counts = np.bincount(all_numbers)
-    counts = counts[counts > 0]
-    starts = np.cumsum(counts) - counts
-    chosen = np.concatenate(
-        [
-            start + np.unique(np.linspace(0, count - 1, _SIGHTS).astype(int))
-            for start, count in zip(starts, counts, strict=True)
-        ]
-    )
-    kept = order[chosen]
-    return SightLines(all_numbers[kept], all_cameras[kept])
+    return SightLines(np.concatenate(numbers), np.concatenate(cameras)).thinned()
 
 
 def _camera_in_target(message: LandmarkMap, image: FeatureTracks) -> Array:

@@ -200,7 +200,7 @@ def corridor_of(scenario: FlightScenario, chaser: int) -> NDArray[np.float32] | 
         )
     begin = np.array(scenario.chasers[chaser].position_m)
     distance_m = float(np.linalg.norm(begin))
-    if distance_m <= scenario.approach.dock_distance_m:
+    if distance_m <= scenario.approach.dock_distance_m or scenario.chooses_port(chaser):
         return None
     end = begin * scenario.approach.dock_distance_m / distance_m
     return tube(begin, end, scenario.approach.docked_position_m)

@@ -431,13 +431,41 @@ class DrawnTruth(Message, frozen=True, kw_only=True):
     bodies: Annotated[tuple[DrawnBody, ...], Meta(max_length=257)]
 
 
+class ChosenPort(Struct, frozen=True, kw_only=True):
+    """A place on a mapped target where chaser ``chaser`` is to dock: position and outward unit
+    normal, TRF, of the map that states it.
+
+    ``number``: of the choice, from 1; it stays while the place follows the map. ``axis_sigma_rad``:
+    standard deviation of the normal. ``flatness_m``: RMS distance of its landmarks from their
+    plane. ``clearance_m``: room about the corridor in front of it, at most 10 m.
+    """
+
+    chaser: ChaserId
+    number: Annotated[int, Meta(ge=1, le=MAX_COUNT)]
+    position_m: Vector3
+    axis: Vector3
+    axis_sigma_rad: float
+    flatness_m: float
+    clearance_m: float
+
+
+class SightedMap(Struct, frozen=True, kw_only=True):
+    """What the map by which a chaser sees an unknown target says: whether a side of the target has
+    returned (``LandmarkMap.closed``), and the chaser's own port.
+    """
+
+    closed: bool
+    port: ChosenPort | None = None
+
+
 class Sighting(Message, frozen=True, kw_only=True):
     """Target poses that a chaser measured in one image; empty ``solutions`` if it detected nothing.
 
     The best solution comes first; a second one follows if a single small marker is ambiguous.
     ``corners_px``: u, v of the four corners of each used marker, in the distorted image.
     ``geometry``: by shape only. ``acquiring``: the chaser is still searching an earlier image for
-    the target, or tracking it through those since then.
+    the target, or tracking it through those since then. ``map``: of an unknown target, once there
+    is one.
     """
 
     chaser: ChaserId
@@ -449,6 +477,7 @@ class Sighting(Message, frozen=True, kw_only=True):
     detail: Text = ""
     geometry: GeometryMeasurement | None = None
     acquiring: bool = False
+    map: SightedMap | None = None
     wall_estimate_s: float = 0.0
 
 
@@ -532,7 +561,9 @@ class LandmarkMap(Message, frozen=True, kw_only=True):
     ``instance``: of the mapper's process. Without a map (see ``status``) there are neither
     ``motion`` nor landmarks. ``landmarks_m``: 3 numbers a landmark, TRF; ``moments_m2``: 6 numbers
     of its covariance (xx, yy, zz, xy, xz, yz). ``scale_share``: standard deviation of all
-    distances, as a share; 1 without a map. ``residual_px``: median of the points'.
+    distances, as a share; 1 without a map. ``residual_px``: median of the points'. ``closed``: a
+    side of the target was seen again after a turn, which makes the rate right. ``ports``: chosen
+    places, at most one a chaser.
     """
 
     status: MapStatus
@@ -545,6 +576,8 @@ class LandmarkMap(Message, frozen=True, kw_only=True):
     scale_share: float = 1.0
     residual_px: float = 0.0
     merges: Count = 0
+    closed: bool = False
+    ports: Annotated[tuple[ChosenPort, ...], Meta(max_length=256)] = ()
 
 
 class Innovation(Struct, frozen=True, kw_only=True):
@@ -879,8 +912,26 @@ class OperatorCommand(Message, frozen=True, kw_only=True):
     expires_ns: Count | None = None
 
 
+class PortRequest(Struct, frozen=True, kw_only=True):
+    """Request to the mapper to judge a place on the target, and to make it the port of chaser
+    ``chaser`` if it will do. Exactly one of ``pixel``, ``point_m`` and ``find`` says where.
+
+    ``pixel``: in the newest image of chaser ``image``, distorted as it is. ``point_m``: the place
+    of the surface nearest to this one, TRF. ``find``: ``flat`` takes the best place of all.
+    """
+
+    chaser: ChaserId
+    image: ChaserId | None = None
+    pixel: tuple[float, float] | None = None
+    point_m: Vector3 | None = None
+    find: Literal["flat"] | None = None
+    operator: Text = ""
+
+
 class CommandReply(Message, frozen=True, kw_only=True):
-    """Reply of the controller to an operator command, also published for the log."""
+    """Reply of the controller to an operator command, also published for the log; of the mapper to
+    a ``PortRequest``.
+    """
 
     command: Text
     chaser: ChaserId
@@ -1042,6 +1093,7 @@ VERSION: dict[type[Struct], int] = {
     RecorderAck: 1,
     OperatorCommand: 2,
     ThrusterFaultCommand: 2,
+    PortRequest: 1,
     CommandReply: 1,
     ControllerState: 2,
     ArmingCommand: 1,

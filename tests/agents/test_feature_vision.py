@@ -29,10 +29,12 @@ from chaserdock_protocol.messages import (
     Image,
     LandmarkMap,
     MappedMotion,
+    SightedMap,
     Sighting,
     Tick,
 )
 from chaserdock_protocol.scenario import Scenario, flight_scenario, parse_scenario
+from message_samples import PORT
 
 LATENCY_TICKS = 60
 CASE: dict[str, Any] = {
@@ -159,6 +161,27 @@ def test_without_a_map_the_sighting_says_why() -> None:
     sighting = next(m for _, m in published if isinstance(m, Sighting))
     assert (sighting.status, sighting.solutions) == ("nothing", ())
     assert sighting.detail == "no map of the target: does not turn"
+
+
+def test_a_sighting_says_whether_the_loop_has_closed_and_which_port_is_its_own() -> None:
+    still = MappedMotion(
+        position_m=(0.0, 0.0, 0.0), velocity_m_s=(0.0, 0.0, 0.0), q_wxyz=(1.0, 0.0, 0.0, 0.0),
+        omega_rad_s=(0.0, 0.05, 0.0), covariance=(0.0,) * 144,
+    )  # fmt: skip
+    own = msgspec.structs.replace(PORT, chaser=0, number=3)
+    core = chaser()
+    flown_to(core, 0, mapper="m")
+    mapped = msgspec.structs.replace(
+        map_of(0, 300), status="mapped", motion=still, closed=True, ports=(own, PORT)
+    )
+    deliver(core, topics.MAP, mapped)
+    maps = []
+    for number in (LATENCY_TICKS - 3, LATENCY_TICKS):  # it counts in the second image
+        deliver(core, topics.TICK, tick(number, "m"))
+        deliver(core, topics.ODOMETRY, odometry(SCENARIO, 0, number))
+        published = deliver(core, topics.IMAGE, image(number))
+        maps += [m.map for _, m in published if isinstance(m, Sighting)]
+    assert maps == [None, SightedMap(closed=True, port=own)]
 
 
 # -- pose by a map ---------------------------------------------------------------------------------

@@ -4,13 +4,18 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from chaserdock_agents.mapper.docking_site import SiteLimits, judged_site, site_on_ray
+from chaserdock_agents.mapper.ports import Decision, MappedPoints, PortChooser
 from chaserdock_agents.mapper.surface import MappedSurface, SightLines, surface_of
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.scenario import PortChoice, flight_scenario, parse_scenario
 
 BOXES = (
     (np.array([0.0, 0.0, 0.0]), np.array([0.3, 0.2, 0.25])),
@@ -220,3 +225,102 @@ def test_an_unseen_place_and_an_uncertain_normal_state_why() -> None:
     assert unseen.why_not == ("no camera has seen it from outside",)
     vague = judged_site(at, outward, surface, landmarks[::4], 100.0 * covariances[::4], LIMITS)
     assert any("normal known to" in why for why in vague.why_not)
+
+
+PORTS: dict[str, Any] = {
+    "name": "ports",
+    "duration_s": 60.0,
+    "perception": {"name": "features"},
+    "target": {"model": "geo_servicer"},
+    "approach": {"dock_distance_m": 0.5},
+    "limits": {"min_distance_target_m": 0.6, "min_distance_chasers_m": 0.4},
+    "docking": {"corridor_angle_deg": 10.0},
+    "chasers": [
+        {"position_m": [-1.9, 0.1, 0.2], "look_at": "target"},
+        {"position_m": [-0.8, -1.7, -0.1], "look_at": "target"},
+    ],
+}
+"""Names, sizes and distances of a mission whose chasers choose ports."""
+
+
+def points_of(turn: Array, shift_m: Array, seed: int = 5) -> MappedPoints:
+    """Return landmarks of the boxes, with noise of their own, in a turned and shifted frame."""
+    surface, landmarks, covariances = the_map()
+    noise = 0.1 * SIGMA_M * np.random.default_rng(seed).normal(size=landmarks.shape)
+    no_sights = SightLines(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+    keys = np.arange(len(landmarks))
+    points = MappedPoints(keys, (landmarks + noise) @ turn.T + shift_m, covariances, no_sights)
+    vertices_m = surface.vertices_m @ turn.T + shift_m
+    vars(points)["surface"] = replace(surface, vertices_m=vertices_m)
+    return points
+
+
+def chooser(**changes: Any) -> PortChooser:
+    out = PortChooser(flight_scenario(parse_scenario(PORTS | changes, "ports")))
+    out.follow(points_of(np.eye(3), np.zeros(3)))
+    return out
+
+
+AT_X = PortChoice(point_m=(0.33, -0.03, 0.04))
+"""A place before the bus, on the side of +X."""
+
+
+def test_a_port_becomes_that_of_its_chaser_and_follows_the_map() -> None:
+    ports = chooser()
+    decision = ports.decide(1, AT_X, None)
+    assert decision.accepted, decision.answer
+    (port,) = ports.ports()
+    assert (port.chaser, port.number) == (1, 1)
+    assert abs(port.position_m[0] - 0.3) < 0.004
+    assert np.degrees(np.arccos(port.axis[0])) < 2.0
+    turn = rotations.to_matrix(rotations.exp([0.02, -0.03, 0.05]))
+    shift = np.array([0.01, -0.02, 0.015])
+    ports.follow(points_of(turn, shift, seed=6))
+    (moved,) = ports.ports()
+    assert moved.number == 1
+    assert np.linalg.norm(moved.position_m - turn @ port.position_m - shift) < 0.003
+    assert np.degrees(np.arccos(np.dot(moved.axis, turn @ port.axis))) < 0.5
+    assert ports.decide(1, PortChoice(point_m=(0.3, 0.05, -0.1)), None).accepted
+    assert ports.ports()[0].number == 2
+
+
+def test_a_pixel_chooses_where_its_line_of_sight_meets_the_target() -> None:
+    ports, camera = chooser(), np.array([1.9, -0.3, 0.4])
+    choice = PortChoice(image=0, pixel=(480.0, 270.0))
+    place = np.array([0.3, -0.03, 0.04])
+    assert ports.decide(0, choice, (camera, place - camera)).accepted
+    assert np.linalg.norm(ports.ports()[0].position_m - place) < 0.02
+    away = ports.decide(0, choice, (camera, camera - place))
+    assert away == Decision(False, "the line of sight does not meet the target")
+    assert len(ports.ports()) == 1  # the one before stays
+
+
+def test_a_place_is_refused_for_its_reasons_and_those_of_reach() -> None:
+    ports = chooser()
+    edge = ports.decide(0, PortChoice(point_m=(0.3, 0.2, 0.0)), None)
+    assert not edge.accepted
+    assert "not flat" in edge.answer
+    assert ports.decide(0, AT_X, None).accepted
+    beside = ports.decide(1, AT_X, None)
+    assert "from chaser 0 at its port; at least 0.4 m" in beside.answer
+    assert "there is no chaser 2" in ports.decide(2, AT_X, None).answer
+    near = chooser(approach={"dock_distance_m": 0.3}).decide(0, AT_X, None)
+    assert "more than chaser.probe_reach_m (0.35 m)" in near.answer
+    empty = PortChooser(flight_scenario(parse_scenario(PORTS, "ports")))
+    assert not empty.decide(0, AT_X, None).accepted
+
+
+def test_a_search_finds_flat_places_for_two_chasers() -> None:
+    ports = chooser()
+    for chaser in (0, 1):
+        decision = ports.decide(chaser, PortChoice(find="flat"), None)
+        assert decision.accepted, decision.answer
+        assert "places will do" in decision.answer
+    one, other = ports.ports()
+    for port in (one, other):
+        at, axis = np.array(port.position_m), np.array(port.axis)
+        assert abs(distance_outside(at[None])[0]) < 0.01
+        assert np.degrees(np.arccos(np.abs(axis).max())) < 3.0  # a side of a box
+        assert port.clearance_m > 0.0
+    docked = [np.array(p.position_m) + 0.5 * np.array(p.axis) for p in (one, other)]
+    assert np.linalg.norm(docked[0] - docked[1]) >= 0.4

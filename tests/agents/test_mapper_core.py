@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 from chaserdock_agents.mapper.core import HELP, MapperCore, TrackCollector
 from chaserdock_agents.mapper.frame import MapFrame
-from chaserdock_agents.mapper.mapper import MapperTuning
+from chaserdock_agents.mapper.mapper import MapperTuning, TargetMap
+from chaserdock_agents.mapper.ports import Decision, PortChooser
 from chaserdock_agents.mapper.types import ConstantRates
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -25,6 +27,7 @@ from chaserdock_protocol.messages import (
     FeatureTracks,
     LandmarkMap,
     Message,
+    PortRequest,
     Tick,
 )
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario, parse_scenario
@@ -141,10 +144,12 @@ def test_in_real_time_nothing_waits() -> None:
     assert collector.complete_tick == 0
 
 
-def flown(until_s: float, chasers: int = 2) -> tuple[list[LandmarkMap], list[Event]]:
+def flown(
+    until_s: float, chasers: int = 2, core: MapperCore | None = None
+) -> tuple[list[LandmarkMap], list[Event]]:
     """Return maps and events from points on a sphere that two chasers see three times a second."""
     changed = {"chasers": CASE["chasers"][:chasers], "time": {"rate_hz": 15, "image_hz": 5}}
-    core = MapperCore(scenario(**changed), instance="m1")
+    core = core or MapperCore(scenario(**changed), instance="m1")
     camera = core.scenario.camera_model()
     out: list[Message] = []
     target = PointTarget(3, chasers=chasers)
@@ -285,3 +290,68 @@ def test_topics_of_the_mapper_are_its_own() -> None:
     assert read == {
         "world/tick", "world/end", "chaser/{chaser}/features", "{process}/presence",
     }  # fmt: skip
+
+
+class ClosedLater(MapperCore):
+    """A mapper whose loop closes at 10 s, and opens again at once."""
+
+    def __init__(self, flight: FlightScenario) -> None:
+        super().__init__(flight)
+        update = self.mapper.update
+
+        def closing(time_s: float) -> TargetMap:
+            found = update(time_s)
+            return replace(found, closed=found.motion is not None and 10.0 <= time_s < 15.0)
+
+        self.mapper.update = closing
+
+
+@pytest.mark.slow(0.1)
+def test_a_port_waits_until_the_loop_has_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    rays: list[Any] = []
+
+    def decide(self: PortChooser, chaser: int, where: Any, ray: Any) -> Decision:
+        rays.append((chaser, where, ray))
+        return Decision(False, "not flat")
+
+    early = MapperCore(scenario())
+    find = PortRequest(chaser=0, find="flat", operator="me")
+    assert "no map of the target: gathering" in early.choose(find)[0].reason
+    monkeypatch.setattr(PortChooser, "decide", decide)
+    entry = {"at_s": 2.0, "command": "port", "chasers": [1], "port": {"find": "flat"}}
+    core = ClosedLater(scenario(timeline=[entry], approach={"dock_distance_m": 0.6}))
+    maps, events = flown(9.0, core=core)
+    assert maps[-1].motion is not None
+    reply, event = core.choose(find)
+    assert (reply.accepted, reply.command, reply.operator) == (False, "port", "me")
+    assert reply.reason.startswith("the loop of the map is open")
+    assert event is not None
+    assert (event.what, event.level) == ("port of chaser 0: refused", "warning")
+    assert rays == []
+    assert not any(e.what.startswith("port") for e in events)
+
+    core = ClosedLater(core.scenario)
+    maps, events = flown(20.0, core=core)
+    closed = [m.closed for m in maps]
+    assert closed == sorted(closed)  # it does not open again
+    assert maps[-1].closed
+    names = [e.what for e in events]
+    assert names[-2:] == ["map of the target: its loop has closed", "port of chaser 1: refused"]
+    assert [r[0] for r in rays] == [1]
+
+    # A pixel on a landmark: the line of sight, in the frame of the map, leads through it.
+    newest, image = maps[-1], core._images[1][-1]
+    known = next(t for t in newest.tracks if t.chaser == 1)
+    row = next(k for k, i in enumerate(image.ids) if i in known.ids)
+    pixel = (image.places[2 * row] * PX_STEP, image.places[2 * row + 1] * PX_STEP)
+    request = PortRequest(chaser=0, image=1, pixel=pixel)
+    assert core.choose(request)[0].reason == "not flat"
+    landmark = known.landmarks[known.ids.index(image.ids[row])]
+    place = np.reshape(newest.landmarks_m, (-1, 3))[landmark]
+    origin, towards = rays[-1][2]
+    towards /= np.linalg.norm(towards)
+    off = place - origin
+    assert off @ towards > 1.0
+    assert np.linalg.norm(off - (off @ towards) * towards) < 0.01
+    two = PortRequest(chaser=0, image=1, pixel=pixel, find="flat")
+    assert core.choose(two)[0].reason.startswith("give either")

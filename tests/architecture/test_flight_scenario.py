@@ -243,6 +243,38 @@ def test_missions_that_need_a_known_shape_are_refused(
         scenario(CHASER, perception={"name": "features"}, **changes)
 
 
+_PORT = {"at_s": 9.0, "command": "port", "chasers": [0], "port": {"find": "flat"}}
+
+
+@pytest.mark.parametrize(
+    ("timeline", "changes", "message"),
+    [
+        ([_PORT | {"port": {}}], {}, "needs either image and pixel, or point_m, or find"),
+        ([_PORT | {"port": {"pixel": [1, 2]}}], {}, "needs either image and pixel"),
+        ([_PORT | {"port": {"find": "flat", "point_m": [1, 0, 0]}}], {}, "needs either"),
+        ([{"at_s": 9.0, "command": "port", "chasers": [0]}], {}, "port goes with the command port"),
+        ([{"at_s": 8.0, "command": "goto", "chasers": [0]}, _PORT], {}, "timeline.0: offset_m"),
+        ([_PORT], {"perception": {"name": "default"}}, "timeline.0: ports are chosen on unknown"),
+        ([_PORT], {"approach": {"dock_distance_m": 0.3}}, "not more than chaser.probe_reach_m"),
+        ([_PORT | {"chasers": [7]}], {}, "there is no chaser 7"),
+        ([_PORT, {"at_s": 9.0, "command": "goto", "chasers": [0]}], {}, ""),
+    ],
+)
+def test_a_port_in_the_timeline_is_checked(
+    timeline: list[dict[str, Any]], changes: dict[str, Any], message: str
+) -> None:
+    unknown = {"perception": {"name": "features"}, "approach": {"dock_distance_m": 0.5}}
+    case = unknown | changes | {"timeline": timeline}
+    if message:
+        with pytest.raises(ScenarioError, match=message):
+            scenario(CHASER, **case)
+        return
+    flown = scenario(CHASER, **case)
+    assert flown.chooses_port(0)
+    assert not flown.chooses_port(1)
+    assert flight_scenario_from_json(flight_scenario_json(flown), "test").chooses_port(0)
+
+
 def test_flight_software_refuses_a_full_scenario() -> None:
     with pytest.raises(ScenarioError, match=r"unknown key seed"):
         flight_scenario_from_json(scenario(CHASER).model_dump_json(), "test")

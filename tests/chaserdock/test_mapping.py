@@ -12,7 +12,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import LandmarkMap, MappedMotion
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from message_samples import BY_TYPE
+from message_samples import BY_TYPE, PORT
 from source_tree import ROOT
 
 from chaserdock.analysis.mapping import (
@@ -20,6 +20,7 @@ from chaserdock.analysis.mapping import (
     mapping_criteria,
     mapping_of,
     mapping_text,
+    ports_at,
 )
 from chaserdock.analysis.motion import Track
 
@@ -100,6 +101,25 @@ def test_the_error_of_the_rate_does_not_depend_on_the_frame() -> None:
     assert unknown is not None
     assert unknown["rate_error_share"] is None
     assert mapping_of([], turning()) is None
+
+
+def test_the_first_map_whose_loop_has_closed_is_named() -> None:
+    maps = [message(7.0, closed=False), message(31.0), message(37.0)]
+    for chosen, at_s in ((maps, 31.0), (maps[:1], None)):
+        found = mapping_of(chosen, turning())
+        assert found is not None
+        assert found["closed_s"] == at_s
+
+
+def test_a_port_is_where_the_map_that_counts_says() -> None:
+    moved = msgspec.structs.replace(PORT, position_m=(0.5, 0.25, -0.125))
+    maps = [message(7.0, ports=()), message(13.0), message(19.0, ports=(moved,))]
+    times = np.array([0.0, 16.9, 17.0, 22.9, 23.0, 40.0])
+    at, axis = ports_at(maps, 4.0, PORT.chaser, times)
+    before, first, last = np.zeros(3), np.array(PORT.position_m), np.array(moved.position_m)
+    assert np.array_equal(at, [before, before, first, first, last, last])
+    assert np.array_equal(axis[:3], [before, before, PORT.axis])
+    assert not ports_at(maps, 4.0, 0, times)[1].any()
 
 
 @pytest.mark.parametrize(

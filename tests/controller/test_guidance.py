@@ -10,7 +10,6 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.guidance.activities.approach import docked_offset_m
 from chaserdock_controller.guidance.fleet import ChaserFleet
 from chaserdock_controller.guidance.phases import (
     TRANSITIONS,
@@ -103,7 +102,7 @@ def test_an_approach_goes_straight_in_to_the_docking_distance_and_docks() -> Non
     answer = order(guidance, operator("approach", 1), 10.0)
     assert (answer.accepted, answer.reason) == (True, "phase approach")
     assert phases(guidance) == ["hold", "approach"]
-    np.testing.assert_allclose(docked_offset_m(guidance.chasers[1]), [0.0, -0.4, 0.0])
+    np.testing.assert_allclose(guidance.chasers[1].line.docked_m, [0.0, -0.4, 0.0])
     end = 10.0 + guidance.chasers[1].state.move.duration_s
     assert end == pytest.approx(10.0 + 1.875 * 0.8 / 0.03)
     for t in np.linspace(10.0, end, 50):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
@@ -13,7 +14,13 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import OperatorCommand, PoseSolution, Sighting
+from chaserdock_protocol.messages import (
+    ChosenPort,
+    OperatorCommand,
+    PoseSolution,
+    SightedMap,
+    Sighting,
+)
 from chaserdock_protocol.scenario import Scenario
 from flight_cases import odometry, scenario, tick_inputs
 
@@ -21,7 +28,7 @@ UNKNOWN: dict[str, Any] = {
     "perception": {"name": "features"},
     "target": {"model": "geo_servicer", "velocity_m_s": [0.0, 0.0, 0.0]},
     "limits": {"min_distance_target_m": 0.9},
-    "approach": {"face_target": True},
+    "approach": {"face_target": True, "dock_distance_m": 0.6, "max_speed_m_s": 0.05},
     "chasers": [
         {"position_m": [-2.0, 0.1, 0.0], "look_at": "target"},
         {"position_m": [-1.0, -1.7, 0.2], "look_at": "target"},
@@ -33,8 +40,9 @@ OMEGA = np.array([0.015, 0.045, 0.03])
 class Flown:
     """Two chasers that move as commanded; the target turns at constant rates."""
 
-    def __init__(self) -> None:
-        self.scenario: Scenario = scenario(**UNKNOWN)
+    def __init__(self, **changes: Any) -> None:
+        self.scenario: Scenario = scenario(**UNKNOWN, **changes)
+        self.map = SightedMap(closed=True)
         self.core, self.tick = ControllerCore(self.scenario, lambda: 0.0), 0
         self.events: list[str] = []
         self.states = [np.zeros(13), np.zeros(13)]
@@ -62,6 +70,7 @@ class Flown:
             tick=self.tick, sim_time_ns=time_ns, chaser=i,
             status="seen" if solutions else "nothing", solutions=solutions, marker_ids=(),
             corners_px=(), rejected_ids=(), detail=detail,
+            map=self.map,
         )  # fmt: skip
 
     def fly(
@@ -156,3 +165,124 @@ def test_a_chaser_flies_to_its_place_and_turns_with_the_target() -> None:
     at = rotations.rotate_inverse(q, flown.states[0][:3])
     assert np.linalg.norm(at - offset) < 0.02
     assert np.linalg.norm(flown.states[1][:3] - flown.scenario.start_pose(1)[0]) < 0.01
+
+
+THERE = OperatorCommand(command="goto", chaser=0, offset_m=(-1.2, 0.0, 0.0))
+TO_PORT = OperatorCommand(command="goto", chaser=0)
+APPROACH = OperatorCommand(command="approach", chaser=0)
+
+
+def port(number: int = 1, shift_m: float = 0.0) -> ChosenPort:
+    """A port beside the middle of the target, whose axis does not meet that."""
+    axis = np.array([-0.93, 0.2, 0.25])
+    return ChosenPort(
+        chaser=0, number=number, position_m=(-0.3, 0.15 + shift_m, -0.1),
+        axis=vector(axis / np.linalg.norm(axis)), axis_sigma_rad=0.01, flatness_m=0.002,
+        clearance_m=0.3,
+    )  # fmt: skip
+
+
+def pose_in_target(flown: Flown) -> tuple[Array, Array]:
+    """Return centre and direction of +X of chaser 0 in TRF."""
+    q = rotations.exp(OMEGA * (flown.tick - 1) / 15.0)
+    x = flown.states[0]
+    forward = rotations.rotate(x[6:10], [1.0, 0.0, 0.0])
+    return rotations.rotate_inverse(q, x[:3]), rotations.rotate_inverse(q, forward)
+
+
+def test_nothing_flies_near_by_a_map_whose_loop_is_open() -> None:
+    flown = Flown()
+    flown.map = SightedMap(closed=False)
+    flown.fly(60)
+    (reply,) = flown.fly(1, "", (THERE,)).replies
+    assert not reply.accepted
+    assert reply.reason.startswith("the loop of the map is open")
+    farther = OperatorCommand(command="goto", chaser=0, offset_m=(-2.2, 0.1, 0.0))
+    (reply,) = flown.fly(1, "", (farther,)).replies
+    assert reply.accepted
+    flown.fly(30)
+    (reply,) = flown.fly(1, "", (APPROACH,)).replies
+    assert reply.reason.startswith("the loop of the map is open")
+    flown.map = SightedMap(closed=True)
+    flown.fly(1)
+    (reply,) = flown.fly(1, "", (THERE,)).replies
+    assert reply.accepted
+
+
+def test_a_goto_without_an_offset_needs_a_port() -> None:
+    flown = Flown()
+    flown.fly(60)
+    (reply,) = flown.fly(1, "", (TO_PORT,)).replies
+    assert (reply.accepted, reply.reason) == (False, "goto needs an offset")
+
+
+@pytest.mark.slow(0.1)
+def test_a_chaser_docks_at_its_port_and_follows_it() -> None:
+    flown = Flown()
+    flown.map = SightedMap(closed=True, port=port())
+    flown.fly(60)
+    (reply,) = flown.fly(1, "", (TO_PORT,)).replies
+    assert reply.accepted, reply.reason
+    assert flown.fly(900).references[0].phase == "hold"
+    axis, base = np.array(port().axis), np.array(port().position_m)
+    place, forward = pose_in_target(flown)
+    assert np.linalg.norm(place) == pytest.approx(1.0, abs=0.02)
+    assert np.linalg.norm(np.cross(place - base, axis)) < 0.02
+    assert np.degrees(np.arccos(forward @ -axis)) < 1.0
+    (reply,) = flown.fly(1, "", (APPROACH,)).replies
+    assert reply.accepted, reply.reason
+    assert flown.fly(300).references[0].phase == "docked"
+    place, forward = pose_in_target(flown)
+    assert np.linalg.norm(place - base - 0.6 * axis) < 0.01
+    assert np.degrees(np.arccos(forward @ -axis)) < 0.5
+    # The next map has it 6 mm aside; another choice does not count before the next goto.
+    flown.map = SightedMap(closed=True, port=port(1, 0.006))
+    out = flown.fly(150)
+    assert out.references[0].phase == "docked"
+    assert np.linalg.norm(out.references[0].offset_m - base - 0.6 * axis - [0, 0.006, 0]) < 1e-6
+    flown.map = SightedMap(closed=True, port=port(2, 0.1))
+    again = flown.fly(150)
+    assert again.references[0].offset_m == out.references[0].offset_m
+    # A mapper that begins again has no port: where the frame is now, nobody knows.
+    flown.map = SightedMap(closed=True)
+    assert flown.fly(2).references[0].phase == "hold"
+    assert any("docked: the map has lost its port" in e for e in flown.events)
+    (reply,) = flown.fly(1, "", (APPROACH,)).replies
+    assert "beside the approach line" in reply.reason
+
+
+def test_the_way_to_a_port_must_not_lead_past_the_target() -> None:
+    flown = Flown()
+    behind = msgspec.structs.replace(port(), position_m=(0.3, 0.1, 0.0), axis=(1.0, 0.0, 0.0))
+    flown.map = SightedMap(closed=True, port=behind)
+    flown.fly(60)
+    (reply,) = flown.fly(1, "", (TO_PORT,)).replies
+    assert not reply.accepted
+    assert "of the middle of the target" in reply.reason
+
+
+@pytest.mark.slow(0.1)
+def test_the_timeline_waits_for_map_and_port_and_the_way_there() -> None:
+    flown = Flown(
+        timeline=[
+            {"at_s": 1.0, "command": "port", "chasers": [0], "port": {"find": "flat"}},
+            {"at_s": 2.0, "command": "goto", "chasers": [0]},
+            {"at_s": 2.0, "command": "approach", "chasers": [0]},
+        ]
+    )
+    flown.map = SightedMap(closed=False)
+    flown.fly(75)
+    flown.map = SightedMap(closed=True)
+    assert flown.fly(75).references[0].phase == "survey"
+    assert not any("goto" in e for e in flown.events)
+    # What a standby would begin with: all but the port, which is the mapper's.
+    assert flown.core.guidance.fleet.left == [1, 2]
+    behind = msgspec.structs.replace(port(), position_m=(0.3, 0.1, 0.0), axis=(1.0, 0.0, 0.0))
+    flown.map = SightedMap(closed=True, port=behind)
+    assert flown.fly(30).references[0].phase == "survey"
+    flown.map = SightedMap(closed=True, port=port(2))
+    assert flown.fly(2).references[0].phase == "goto"
+    assert flown.core.guidance.fleet.left == [2]
+    flown.fly(1100)
+    assert flown.core.guidance.fleet.left == []
+    assert flown.fly(1).references[0].phase == "docked"

@@ -9,16 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
+    CommandReply,
     Event,
     FeatureTracks,
     LandmarkMap,
     Message,
+    MissionEnd,
+    PortRequest,
+    Reference,
     Sighting,
     TargetEstimate,
     Tick,
 )
+from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.recording.log import LogError, read_log
+from chaserdock_protocol.transport import Node
 from source_tree import ROOT
 
 from chaserdock.analysis.flight import load_flight
@@ -132,3 +139,51 @@ def test_a_flight_goes_on_without_its_mapper(tmp_path: Path) -> None:
     assert ticks[-1].tick == 14 * 15 - 1
     # The last map counts on.
     assert any(isinstance(m, Sighting) and m.solutions and m.tick > 190 for m in found)
+
+
+@pytest.mark.slow(0.1)
+def test_the_mapper_answers_an_operator_who_chooses_a_port(tmp_path: Path) -> None:
+    replies: list[CommandReply] = []
+
+    def ask(options: ProcessOptions) -> int:
+        node = Node("operator", "operator", options.link)
+        node.subscribe(topics.TICK)
+        node.subscribe(topics.END)
+        try:
+            while not replies:
+                received = node.receive(0.5)
+                message = None if received is None else received.message
+                if isinstance(message, MissionEnd):
+                    return 1
+                if isinstance(message, Tick) and message.tick >= 100:
+                    request = PortRequest(chaser=0, find="flat", operator="me")
+                    reply = node.query(topics.PORT_KEY, request, CommandReply, 5.0)
+                    replies.extend([] if reply is None else [reply])
+            return 0
+        finally:
+            node.close()
+
+    asked = simulate(PATH, tmp_path / "run", SHORTER, others={"operator": ask})
+    assert asked.statuses["operator"] == 0
+    (reply,) = replies
+    assert (reply.command, reply.accepted, reply.operator) == ("port", False, "me")
+    assert reply.reason.startswith("the loop of the map is open")
+    logged = [m for m in messages(asked) if isinstance(m, Event) and m.process == "mapper"]
+    assert logged[-1].what == "port of chaser 0: refused"
+
+
+@pytest.mark.slow
+def test_two_chasers_dock_where_the_map_is_flat(tmp_path: Path) -> None:
+    docked = simulate(ROOT / "scenarios/unknown-docking.toml", tmp_path / "run")
+    assert not docked.crashes
+    result = summary_of(load_flight(docked.folder))
+    assert all(result["chasers"][i]["docked"] for i in ("0", "1")), result["failures"]
+    assert result["collisions"] == 0
+    what = [m.what for m in messages(docked) if isinstance(m, Event)]
+    assert what.index("map of the target: its loop has closed") < what.index(
+        "port of chaser 0: chosen"
+    )
+    # Nothing leaves its survey before the map with the ports counts.
+    ports = next(m for m in messages(docked) if isinstance(m, LandmarkMap) and m.ports)
+    left = next(m for m in messages(docked) if isinstance(m, Reference) and m.phase != "survey")
+    assert left.tick >= ports.tick + 60

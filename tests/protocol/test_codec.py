@@ -59,6 +59,7 @@ def test_there_is_a_sample_of_every_message() -> None:
     types = {t for t in vars(m).values() if isinstance(t, type) and issubclass(t, msgspec.Struct)}
     parts = {
         m.CameraCalibration,
+        m.ChosenPort,
         m.CommandedWrench,
         m.DrawnBody,
         m.ExpectedPose,
@@ -72,6 +73,7 @@ def test_there_is_a_sample_of_every_message() -> None:
         m.ProbeTouch,
         m.RangeMeasurement,
         m.RelativeEstimate,
+        m.SightedMap,
         m.ThrusterPulse,
     }
     assert types - set(m.VERSION) - {msgspec.Struct, m.Message} - parts == set()

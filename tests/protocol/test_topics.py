@@ -82,6 +82,7 @@ def test_the_table_holds_every_topic_of_the_module_once() -> None:
         topics.JOIN_KEY,
         topics.SCENARIO_KEY,
         topics.OPERATE_KEY,
+        topics.PORT_KEY,
         topics.THRUSTER_FAULT_KEY,
         topics.ARMING_KEY,
     ],

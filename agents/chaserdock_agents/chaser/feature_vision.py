@@ -29,6 +29,7 @@ from chaserdock_protocol.messages import (
     LandmarkMap,
     MappedMotion,
     Odometry,
+    SightedMap,
     Sighting,
     Tick,
 )
@@ -172,7 +173,16 @@ class FeatureVision(Vision):
         self.tracks = self._tracks(
             image, "seen" if len(seen.ids) else "nothing", *pose, seen, described
         )
-        return self._sighting_by(counting, image, seen, pose)
+        sighting = self._sighting_by(counting, image, seen, pose)
+        return msgspec.structs.replace(sighting, map=self._sighted(counting))
+
+    def _sighted(self, counting: CountingMap | None) -> SightedMap | None:
+        """Return what the map that counts says to the controller."""
+        if counting is None or counting.message.motion is None:
+            return None
+        ports = counting.message.ports
+        own = next((p for p in ports if p.chaser == self._chaser), None)
+        return SightedMap(closed=counting.message.closed, port=own)
 
     def _sighting_by(
         self,

@@ -12,6 +12,7 @@ from collections import deque
 import msgspec
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
@@ -19,6 +20,7 @@ from chaserdock_protocol.messages import (
     DESCRIPTION_BYTES,
     MAX_COUNT,
     PX_STEP,
+    CommandReply,
     Event,
     FeatureTracks,
     KnownTracks,
@@ -26,13 +28,16 @@ from chaserdock_protocol.messages import (
     MappedMotion,
     MapStatus,
     Message,
+    PortRequest,
     Tick,
 )
-from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario import FlightScenario, PortChoice
 from chaserdock_protocol.topics import Topic
 
 from .frame import MapFrame
 from .mapper import MAP_STATUS, Mapper, TargetMap
+from .ports import Decision, MappedPoints, PortChooser
+from .surface import SightLines
 from .types import CameraUncertainty, ImageTracks
 
 HELP: dict[MapStatus, str] = {
@@ -49,6 +54,10 @@ HELP: dict[MapStatus, str] = {
 _AHEAD_TICKS = 8
 """Most ticks by which a chaser may know of a tick earlier than this process, as in the controller;
 messages that claim more are dropped."""
+_REMEMBERED = 256
+"""Images of a chaser in which a place may be pointed at: 50 s of five a second."""
+OPEN = "the loop of the map is open: no side of the target has returned yet"
+"""Why nothing flies near, nor chooses a place there."""
 
 
 class TrackCollector:
@@ -152,6 +161,18 @@ class MapperCore:
         self._camera, self._frame = camera, MapFrame()
         self._status: MapStatus | None = None
         self._next_tick = 0
+        self._closed = False
+        self._ports = PortChooser(scenario)
+        self._map: LandmarkMap | None = None
+        self._images: list[deque[FeatureTracks]] = [
+            deque(maxlen=_REMEMBERED) for _ in scenario.chasers
+        ]
+        self._timeline = [
+            (entry.at_s, chaser, entry.port)
+            for entry in sorted(scenario.timeline, key=lambda entry: entry.at_s)
+            if entry.port is not None
+            for chaser in entry.chasers
+        ]
 
     def step(self, message: Message) -> int | None:
         """Take a message; return the tick of a map that is due now, or None."""
@@ -159,7 +180,10 @@ class MapperCore:
             case Tick():
                 self.collector.add_tick(message)
             case FeatureTracks():
+                stale = self.collector.stale
                 self.collector.add(message)
+                if self.collector.stale == stale and message.status != "bad_image":
+                    self._images[message.chaser].append(message)
             case _:
                 return None
         tick = self.collector.complete_tick
@@ -179,12 +203,117 @@ class MapperCore:
         period_s = section.period_s if mapped else section.first_period_s
         images = max(1, round(period_s * timing.image_hz))
         self._next_tick = tick + images * timing.ticks_per_image
+        before, self._closed = self._closed, self._closed or found.closed
         message = self._message(found, tick, time_ns)
+        events = [_event(message)] if found.status != self._status else []
+        self._status = found.status
+        if self._closed and not before:
+            what = "map of the target: its loop has closed"
+            events.append(event_of(message, what, _known(message)))
+        if message.motion is not None:
+            self._map = message
+            if self._closed:
+                self._ports.follow(self._points(found, message))
+                events += self._choose_due(message)
+                message = msgspec.structs.replace(message, ports=self._ports.ports())
         out: list[tuple[Topic, str | None, Message]] = [(topics.MAP, None, message)]
-        if found.status != self._status:
-            self._status = found.status
-            out.append((topics.EVENT, "mapper", _event(message)))
-        return out
+        return [*out, *((topics.EVENT, "mapper", event) for event in events)]
+
+    # -- ports -------------------------------------------------------------------------------------
+
+    def choose(self, request: PortRequest) -> tuple[CommandReply, Event | None]:
+        """Answer an operator who points at a place; any thread may ask. The port, if it becomes
+        one, is in the next map.
+        """
+        wanted = [request.pixel, request.point_m, request.find]
+        newest = self._map
+        if sum(w is not None for w in wanted) != 1 or (request.pixel is None) != (
+            request.image is None
+        ):
+            decision = Decision(False, "give either image and pixel, or a point, or what to find")
+        elif newest is None:
+            decision = Decision(False, f"no map of the target: {self._status or 'gathering'}")
+        else:
+            decision = self._decide(request.chaser, request, newest)
+        head = newest or LandmarkMap(status="gathering", next_tick=0)
+        reply = CommandReply(
+            tick=head.tick,
+            sim_time_ns=head.sim_time_ns,
+            command="port",
+            chaser=request.chaser,
+            accepted=decision.accepted,
+            reason=decision.answer[:_LONGEST],
+            operator=request.operator,
+        )
+        return reply, None if newest is None else _port_event(newest, request.chaser, decision)
+
+    def _choose_due(self, message: LandmarkMap) -> list[Event]:
+        """Choose the ports that the timeline asks for."""
+        events: list[Event] = []
+        time_s = message.sim_time_ns / 1e9
+        while self._timeline and self._timeline[0][0] <= time_s:
+            _, chaser, choice = self._timeline.pop(0)
+            events.append(_port_event(message, chaser, self._decide(chaser, choice, message)))
+        return events
+
+    def _decide(
+        self, chaser: int, where: PortRequest | PortChoice, newest: LandmarkMap
+    ) -> Decision:
+        if newest.status != "mapped":
+            return Decision(False, f"no distances in the map: {newest.status}")
+        if not self._closed:
+            return Decision(False, OPEN)
+        if where.pixel is None:
+            return self._ports.decide(chaser, where, None)
+        image = self._image_for(where, newest)
+        if image is None:
+            return Decision(False, f"no image of chaser {where.image} at that time")
+        camera = self._camera
+        x, y = camera.normalized(camera.undistort(np.array(where.pixel))).tolist()
+        towards_w = rotations.rotate(image.q_wxyz, [x, y, 1.0])
+        place, q = pose_at(newest, image.sim_time_ns)
+        ray = (
+            rotations.rotate_inverse(q, np.array(image.position_m) - place),
+            rotations.rotate_inverse(q, towards_w),
+        )
+        return self._ports.decide(chaser, where, ray)
+
+    def _image_for(
+        self, where: PortRequest | PortChoice, newest: LandmarkMap
+    ) -> FeatureTracks | None:
+        """Return the image in which a pixel was pointed at: the newest one or, of the timeline, the
+        newest that the map has seen.
+        """
+        if where.image is None or where.image >= len(self._images):
+            return None
+        of_timeline = isinstance(where, PortChoice)
+        images = [
+            image
+            for image in tuple(self._images[where.image])
+            if not of_timeline or image.tick <= newest.tick
+        ]
+        return images[-1] if images else None
+
+    def _points(self, found: TargetMap, message: LandmarkMap) -> MappedPoints:
+        """Return the landmarks of a map in its frame, and from where they were seen."""
+        numbers, cameras = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
+        for chaser, views in enumerate(self.mapper.kept_views()):
+            ids, rows = self.mapper.known_tracks(chaser)
+            for view in views:
+                seen = rows[np.isin(ids, view.ids)]
+                place, q = pose_at(message, round(view.time_s * 1e9))
+                camera = rotations.rotate_inverse(q, view.position_w_m - place)
+                numbers.append(seen)
+                cameras.append(np.tile(camera, (len(seen), 1)))
+        sights = SightLines(np.concatenate(numbers), np.concatenate(cameras)).thinned()
+        return MappedPoints(
+            found.keys,
+            np.reshape(message.landmarks_m, (-1, 3)),
+            self._frame.moments(found.covariances_m2),
+            sights,
+        )
+
+    # -- messages ----------------------------------------------------------------------------------
 
     def _add(self, message: FeatureTracks) -> None:
         px = np.array(message.places, dtype=float).reshape(-1, 2) * PX_STEP
@@ -237,6 +366,7 @@ class MapperCore:
             scale_share=found.scale_share,
             residual_px=found.residual_px,
             merges=found.merges,
+            closed=self._closed,
         )
 
     def _tracks(self, chaser: int) -> KnownTracks:
@@ -260,21 +390,50 @@ def _is_whole(tracks: FeatureTracks) -> bool:
     )
 
 
+def pose_at(message: LandmarkMap, time_ns: int) -> tuple[Array, Array]:
+    """Return position (3,), WRF, and attitude (4,), TRF to WRF, of a mapped target at a time."""
+    motion = message.motion
+    assert motion is not None
+    elapsed_s = (time_ns - message.sim_time_ns) / 1e9
+    q = rotations.integrate(np.array(motion.q_wxyz), np.array(motion.omega_rad_s), elapsed_s)
+    return np.array(motion.position_m) + elapsed_s * np.array(motion.velocity_m_s), q
+
+
+def _known(message: LandmarkMap) -> str:
+    """Return what a map knows, for an operator."""
+    assert message.motion is not None
+    rate_deg_s = float(np.rad2deg(np.linalg.norm(message.motion.omega_rad_s)))
+    return (
+        f"{len(message.landmarks_m) // 3} landmarks, {rate_deg_s:.3f} deg/s, "
+        f"scale {100.0 * message.scale_share:.2g} %"
+    )
+
+
 def _event(message: LandmarkMap) -> Event:
     """Return the event of a new status."""
     detail = HELP[message.status]
     if message.motion is not None:
-        rate_deg_s = float(np.rad2deg(np.linalg.norm(message.motion.omega_rad_s)))
-        known = (
-            f"{len(message.landmarks_m) // 3} landmarks, {rate_deg_s:.3f} deg/s, "
-            f"scale {100.0 * message.scale_share:.2g} %"
-        )
-        detail = f"{known}; {detail}" if detail else known
+        detail = f"{_known(message)}; {detail}" if detail else _known(message)
+    calm = message.status in ("gathering", "mapped")
+    return event_of(message, f"map of the target: {message.status}", detail, calm)
+
+
+def _port_event(message: LandmarkMap, chaser: int, decision: Decision) -> Event:
+    what = f"port of chaser {chaser}: {'chosen' if decision.accepted else 'refused'}"
+    return event_of(message, what, decision.answer, decision.accepted)
+
+
+def event_of(message: LandmarkMap, what: str, detail: str, calm: bool = True) -> Event:
+    """Return an event of the mapper at the time of a map."""
     return Event(
         tick=message.tick,
         sim_time_ns=message.sim_time_ns,
         process="mapper",
-        level="info" if message.status in ("gathering", "mapped") else "warning",
-        what=f"map of the target: {message.status}",
-        detail=detail,
+        level="info" if calm else "warning",
+        what=what,
+        detail=detail[:_LONGEST],
     )
+
+
+_LONGEST = 1900
+"""Characters of an answer, below the limit of ``Text``."""

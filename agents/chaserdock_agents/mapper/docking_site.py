@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from numpy.typing import NDArray
 
 from .surface import MappedSurface, met_triangles
 
@@ -104,27 +105,21 @@ def judged_site(
     seen: bool = True,
 ) -> DockingSite:
     """Judge a place (3,) of which ``outward`` (3,) says roughly where outside is."""
-    near = np.linalg.norm(landmarks_m - at_m, axis=1) <= _RADIUS_M
-    points, covariances = landmarks_m[near], covariances_m2[near]
     why: list[str] = [] if seen else ["no camera has seen it from outside"]
-    if len(points) < _LEAST_LANDMARKS:
+    found = plane_near(at_m, outward, landmarks_m, covariances_m2)
+    if found is None:
+        count = int(landmarks_near(at_m, landmarks_m).sum())
         why.append(
-            f"{len(points)} landmarks within {_RADIUS_M * 1e2:.0f} cm, at least {_LEAST_LANDMARKS}"
+            f"{count} landmarks within {_RADIUS_M * 1e2:.0f} cm, at least {_LEAST_LANDMARKS}"
         )
         normal = outward / np.linalg.norm(outward)
         clear_m = _clearance(at_m, normal, surface, limits)
-        return DockingSite(
-            at_m, normal, math.inf, math.inf, math.inf, len(points), clear_m, tuple(why)
-        )
-    plane = _Plane.through(points, covariances, outward)
+        return DockingSite(at_m, normal, math.inf, math.inf, math.inf, count, clear_m, tuple(why))
+    plane, points, off_plane = found
+    if off_plane > (1.0 - _PLANE_SHARE) * len(points):
+        within = f"{len(points) - off_plane} of {len(points)}"
+        why.append(f"not flat: {within} landmarks lie in one plane")
     off = plane.distances(points)
-    kept = np.abs(off) <= np.maximum(_OUTLIER_SIGMAS * plane.sigmas(covariances), 1e-3)
-    if kept.sum() < _PLANE_SHARE * len(points):
-        why.append(f"not flat: {kept.sum()} of {len(points)} landmarks lie in one plane")
-    elif kept.sum() < len(points):
-        points, covariances = points[kept], covariances[kept]
-        plane = _Plane.through(points, covariances, outward)
-        off = plane.distances(points)
     flatness_m = float(np.sqrt(np.mean(off**2)))
     position = at_m - float(plane.distances(at_m[None])[0]) * plane.normal
     clear_m = _clearance(position, plane.normal, surface, limits)
@@ -152,8 +147,32 @@ def judged_site(
     )
 
 
+def landmarks_near(at_m: Array, landmarks_m: Array) -> NDArray[np.bool_]:
+    """Return which landmarks (n, 3) make the plane of a place (3,), (n,)."""
+    return np.linalg.norm(landmarks_m - at_m, axis=1) <= _RADIUS_M
+
+
+def plane_near(
+    at_m: Array, outward: Array, landmarks_m: Array, covariances_m2: Array
+) -> tuple[SitePlane, Array, int] | None:
+    """Return the plane of the landmarks near a place (3,), the landmarks (k, 3) that make it, and
+    how many of these are not in it; None if too few are near.
+    """
+    near = landmarks_near(at_m, landmarks_m)
+    points, covariances = landmarks_m[near], covariances_m2[near]
+    if len(points) < _LEAST_LANDMARKS:
+        return None
+    plane = SitePlane.through(points, covariances, outward)
+    off = np.abs(plane.distances(points))
+    kept = off <= np.maximum(_OUTLIER_SIGMAS * plane.sigmas(covariances), 1e-3)
+    if _PLANE_SHARE * len(points) <= kept.sum() < len(points):
+        plane = SitePlane.through(points[kept], covariances[kept], outward)
+        return plane, points[kept], 0
+    return plane, points, int((~kept).sum())
+
+
 @dataclass(frozen=True, eq=False)
-class _Plane:
+class SitePlane:
     """A plane through a centre (3,) with a unit normal (3,), and the accuracy of both."""
 
     centre_m: Array
@@ -162,7 +181,7 @@ class _Plane:
     normal_sigma_rad: float
 
     @classmethod
-    def through(cls, points: Array, covariances: Array, outward: Array) -> _Plane:
+    def through(cls, points: Array, covariances: Array, outward: Array) -> SitePlane:
         """Return the plane nearest to points (n, 3), weighted by their covariances (n, 3, 3).
 
         The normal is that of the least spread; its standard deviation is the larger of the two
@@ -201,7 +220,7 @@ def _clearance(at_m: Array, normal: Array, surface: MappedSurface, limits: SiteL
     the corridor's half angle, over the corridor's length. Points of the surface within the reach
     are beside the probe and do not count.
     """
-    off = _dense(surface) - at_m
+    off = surface.dense_m - at_m
     ahead = off @ normal
     aside = np.linalg.norm(off - ahead[:, None] * normal, axis=1)
     inside = (ahead > limits.reach_m) & (ahead < limits.reach_m + limits.corridor_m)
@@ -209,12 +228,3 @@ def _clearance(at_m: Array, normal: Array, surface: MappedSurface, limits: SiteL
         return math.inf
     needed = limits.radius_m + (ahead - limits.reach_m) * math.tan(limits.corridor_half_angle_rad)
     return float((aside - needed)[inside].min())
-
-
-def _dense(surface: MappedSurface) -> Array:
-    """Return vertices, middles of edges and of triangles (k, 3): long triangles have no vertex near
-    a corridor that they cross.
-    """
-    corners = surface.vertices_m[surface.triangles]
-    shares = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4.0
-    return np.einsum("sk,tkd->tsd", shares, corners).reshape(-1, 3)

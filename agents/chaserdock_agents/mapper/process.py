@@ -3,9 +3,19 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable
+
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import create_fault_layer
-from chaserdock_protocol.messages import JoinReply, MissionEnd, Presence, Tick
+from chaserdock_protocol.messages import (
+    CommandReply,
+    JoinReply,
+    MissionEnd,
+    PortRequest,
+    Presence,
+    Tick,
+)
 from chaserdock_protocol.process import ProcessOptions, StopSignal
 from chaserdock_protocol.scenario import flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
@@ -63,9 +73,19 @@ class MapperProcess:
             self._map, self._end_mapping = node.host.worker(self._map_target)
             node.on_close(self._end_mapping)
         self.heartbeat = Heartbeat(node, core.instance, stall_s)
+        self._requests: deque[tuple[PortRequest, Callable[[CommandReply], None]]] = deque()
+        node.declare_queryable(
+            topics.PORT_KEY, PortRequest, lambda *request: self._requests.append(request)
+        )
 
     def listen(self) -> None:
-        """Wait for one message and handle it."""
+        """Answer operators, then wait for one message and handle it."""
+        while self._requests:
+            request, reply = self._requests.popleft()
+            answer, event = self.core.choose(request)
+            reply(answer)
+            if event is not None:
+                self.node.publish(topics.EVENT, event, NAME)
         received = self.node.receive(_RECEIVE_TIMEOUT_S)
         self.heartbeat.report_waiting(received, self.core.collector.missing_keys)
         if received is None:

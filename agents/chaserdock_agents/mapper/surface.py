@@ -10,6 +10,7 @@ faces are marked, and stand for what may be behind them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
@@ -28,6 +29,9 @@ _DEPTH_M = 0.005
 _GRAZING = 0.17
 """Cosine of the angle between a face's normal and a line of sight up to which its vertices count as
 seen from outside: 80 degrees."""
+MOST_SIGHTS = 6
+"""Lines of sight of each landmark, spread over the flight: three landmarks must have one through a
+place to make it empty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,18 @@ class SightLines:
 
     landmarks: IntArray
     cameras_m: Array
+
+    def thinned(self, most: int = MOST_SIGHTS) -> SightLines:
+        """Return at most so many lines of sight of each landmark, spread over their order."""
+        order = np.argsort(self.landmarks, kind="stable")
+        counts = np.bincount(self.landmarks)
+        counts = counts[counts > 0]
+        chosen = [
+            start + np.unique(np.linspace(0, count - 1, most).astype(int))
+            for start, count in zip(np.cumsum(counts) - counts, counts, strict=True)
+        ]
+        kept = order[np.concatenate([np.zeros(0, dtype=np.int64), *chosen])]
+        return SightLines(self.landmarks[kept], self.cameras_m[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +73,15 @@ class MappedSurface:
         normals = np.cross(b - a, c - a)
         return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
+    @cached_property
+    def dense_m(self) -> Array:
+        """Vertices, middles of edges and of triangles, and points between (k, 3): long triangles
+        have no vertex near a place that they cross.
+        """
+        corners = self.vertices_m[self.triangles]
+        shares = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4.0
+        return np.einsum("sk,tkd->tsd", shares, corners).reshape(-1, 3)
+
     def volume_m3(self) -> float:
         """Return the enclosed volume."""
         a, b, c = (self.vertices_m[self.triangles[:, k]] for k in range(3))
@@ -68,21 +93,20 @@ def surface_of(
 ) -> MappedSurface | None:
     """Return the surface of landmarks (n, 3), TRF, with covariances (n, 3, 3); None of too few.
 
-    Every landmark stays a vertex only if it is on the boundary. The cost is that of all lines of
-    sight times all faces: a few per landmark suffice.
+    Every landmark stays a vertex only if it is on the boundary. A few lines of sight per landmark
+    suffice.
     """
     if len(landmarks_m) < _LEAST_LANDMARKS:
         return None
-    tetrahedra = Delaunay(landmarks_m).simplices.astype(np.int64)
+    mesh = Delaunay(landmarks_m)
+    tetrahedra = mesh.simplices.astype(np.int64)
     faces, owners = _sides(tetrahedra)
-    crossings = np.zeros(len(tetrahedra), dtype=np.int64)
     ends, starts = _shortened(landmarks_m, covariances_m2, sights)
-    corners = landmarks_m[faces]
-    for landmark in np.unique(sights.landmarks):
-        of_it = np.flatnonzero(sights.landmarks == landmark)
-        met = [met_triangles(starts[k], ends[k] - starts[k], corners) for k in of_it]
-        crossed = np.unique(owners[np.concatenate([faces[t <= 1.0] for faces, t in met])])
-        crossings[crossed[crossed >= 0]] += 1
+    crossed = _crossed(mesh, ends, starts - ends)
+    by_landmark = np.unique(
+        np.column_stack([sights.landmarks[crossed[:, 0]], crossed[:, 1]]), axis=0
+    )
+    crossings = np.bincount(by_landmark[:, 1], minlength=len(tetrahedra))
     solid = crossings < _LEAST_CROSSINGS
     triangles = _boundary(landmarks_m, tetrahedra, faces, owners, solid)
     if not len(triangles):
@@ -109,6 +133,36 @@ def _sides(tetrahedra: IntArray) -> tuple[IntArray, IntArray]:
     owners[sorted_faces[first], 0] = order[first] // 4
     owners[sorted_faces[~first], 1] = order[~first] // 4
     return faces, owners
+
+
+def _crossed(mesh: Delaunay, origins_m: Array, along_m: Array) -> IntArray:
+    """Return pairs (k, 2) of a line (n,) and a tetrahedron that it crosses. Lines lead from
+    ``origins_m`` (n, 3) by ``along_m`` (n, 3); those that begin outside cross none.
+
+    All lines walk at once, from each tetrahedron through the face by which they leave it.
+    """
+    corners = mesh.points[mesh.simplices]
+    # Of the face opposite to each corner: its own corners, and its outward normal.
+    a, b, c = (corners[:, [(k + step) % 4 for k in range(4)]] for step in (1, 2, 3))
+    normals = np.cross(b - a, c - a)
+    normals[np.einsum("tkj,tkj->tk", normals, corners - a) > 0.0] *= -1.0
+    offsets = np.einsum("tkj,tkj->tk", normals, a)
+    line = np.arange(len(origins_m))
+    at = mesh.find_simplex(origins_m).astype(np.int64)
+    pairs = []
+    for _ in range(len(corners)):
+        inside = at >= 0
+        line, at = line[inside], at[inside]
+        if not len(line):
+            break
+        pairs.append(np.column_stack([line, at]))
+        speed = np.einsum("nkj,nj->nk", normals[at], along_m[line])
+        room = offsets[at] - np.einsum("nkj,nj->nk", normals[at], origins_m[line])
+        share = np.where(speed > 0.0, room / np.where(speed > 0.0, speed, 1.0), np.inf)
+        face = np.argmin(share, axis=1)
+        rows = np.arange(len(line))
+        at = np.where(share[rows, face] < 1.0, mesh.neighbors[at, face], -1).astype(np.int64)
+    return np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])
 
 
 def _shortened(

@@ -169,6 +169,8 @@ class KeepOutZone(Check):
         """Return the smallest allowed distance from the target of a chaser at an offset (3,),
         TRF.
         """
+        if self.scenario.chooses_port(int(name.partition("/")[2])):
+            return self._nearest_m[name]  # the scenario does not know its corridor
         cone = self._cones.get(name)
         if cone is not None and (
             cone.room_m(offset_m) > -KEEP_OUT_SLACK_M

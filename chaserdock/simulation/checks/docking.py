@@ -294,9 +294,12 @@ class DockedOrSafe(Check):
 
 
 def chasers_to_dock(s: Scenario) -> list[int]:
-    """Return the chasers that are to dock or latch and are commanded to approach before the end."""
+    """Return the chasers that are to dock or latch and are commanded to approach before the end;
+    without those whose port is chosen in flight, for which there may be none.
+    """
     rows = [e for e in s.timeline if e.command == "approach" and e.at_s < s.duration_s]
-    return sorted({i for e in rows for i in e.chasers} & {*s.success.docked, *s.success.latched})
+    approaching = {i for e in rows for i in e.chasers if not s.chooses_port(i)}
+    return sorted(approaching & {*s.success.docked, *s.success.latched})
 
 
 def concerned(event: Event, chasers: int) -> set[int]:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from chaserdock_models.arrays import Array, length
-from chaserdock_protocol.messages import Latch, OperatorCommand
+from chaserdock_protocol.messages import ChosenPort, Latch, OperatorCommand, SightedMap
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import (
@@ -26,6 +26,7 @@ from chaserdock_controller.interfaces import (
 
 from . import command_validation as validation
 from .approach_cone import Cone, cone_of
+from .approach_line import approach_line
 from .chaser_state import (
     Cause,
     ChaserGuidance,
@@ -126,13 +127,16 @@ class ChaserMachine:
     safety is enforced. ``failure``: why no plan of it can be flown. ``interrupted``: it resumes its
     approach when the target is seen again. ``abort_margin``: sigmas of its best abort. ``led_s``:
     time of the last tick in which its state and the target's pose were known. ``unseen``: why its
-    last image showed no pose, or empty. ``changes``: log that all chasers share.
+    last image showed no pose, or empty. ``sighted``: what its last image with a map of an unknown
+    target said of that. ``port``: chosen on that map, as the chaser uses it. ``line``: of its
+    approach, if it docks at a distance. ``changes``: log that all chasers share.
     """
 
     def __init__(self, scenario: FlightScenario, number: int, changes: list[PhaseChange]) -> None:
         self.scenario, self.number, self._changes = scenario, number, changes
         self.nominal_m = np.asarray(scenario.chasers[number].position_m)
         self.dock, self._cone = dock_of(scenario, number), cone_of(scenario, number)
+        self.line = approach_line(scenario, number)
         self.thrusters = ThrusterCommands(scenario.chaser)
         first = Phase.SURVEY if scenario.maps_target else Phase.ACQUIRE
         self.state = ChaserGuidance(first, 0.0, stay(self.nominal_m, 0.0))
@@ -144,6 +148,8 @@ class ChaserMachine:
         self.abort_margin: float | None = None
         self.led_s: float | None = None
         self.unseen = ""
+        self.sighted: SightedMap | None = None
+        self.port: ChosenPort | None = None
         self._last_command: tuple[float, OperatorCommand] | None = None
         self._activities: dict[Phase, Activity] = {}
         self._answering: dict[str, Activity] = {}
@@ -164,6 +170,34 @@ class ChaserMachine:
             if activity.by_capture in (None, self.by_capture):
                 self._activities |= dict.fromkeys(activity.phases, activity)
                 self._answering |= dict.fromkeys(activity.commands, activity)
+
+    # -- port on an unknown target ----------------------------------------------------------------
+
+    def sight_map(self, sighted: SightedMap, now_s: float) -> None:
+        """Take what an image says of the map. The chaser's port follows the map; another choice
+        counts from the next `goto` on, or at once in the survey. Without its port, as of a mapper
+        that begins again, it holds.
+        """
+        self.sighted = sighted
+        old, new = self.port, sighted.port
+        if old is not None and new is None:
+            self.use_port(None)
+            self.fire(Trigger.COMMAND_HOLD, now_s, "the map has lost its port")
+        if new is not None and (
+            self.phase is Phase.SURVEY or (old is not None and old.number == new.number)
+        ):
+            self.use_port(new)
+
+    def use_port(self, port: ChosenPort | None) -> None:
+        """Dock at a port from now on."""
+        self.port = port
+        self.line = approach_line(self.scenario, self.number, port)
+
+    def cone(self) -> Cone:
+        """Return the corridor of the chaser's approach."""
+        if self.port is None:
+            return self._cone
+        return self.line.cone(math.radians(self.scenario.docking.corridor_angle_deg))
 
     # -- phase changes -----------------------------------------------------------------------------
 
@@ -351,13 +385,14 @@ class ChaserMachine:
             applies = near or self.phase in (Phase.APPROACH, Phase.DOCKED)
         else:
             applies = self.in_corridor()
-        return self._cone if applies and self._cone.room_m(position) > -GUIDANCE.outside_m else None
+        cone = self.cone()
+        return cone if applies and cone.room_m(position) > -GUIDANCE.outside_m else None
 
     def min_distance_target_m(self) -> float:
         """Return the distance from the target that a plan must keep; 0 while the latch holds it."""
         limit, dock = self.scenario.limits.min_distance_target_m, self.dock
         if dock is None:
-            docked_m = max(0.0, self.scenario.approach.dock_distance_m - GUIDANCE.held_margin_m)
+            docked_m = max(0.0, length(self.line.docked_m) - GUIDANCE.held_margin_m)
             return min(limit, docked_m) if self.corridor() is not None else limit
         if not self.in_corridor():
             return limit

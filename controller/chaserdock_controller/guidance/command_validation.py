@@ -5,12 +5,11 @@ functions.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import OperatorCommand
+from chaserdock_protocol.messages import OperatorCommand, SightedMap
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.checks import angle_deg, shape_distance_m, shapes_apart_m
 from numpy.typing import ArrayLike
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike
 from chaserdock_controller.interfaces import PlanningFailure
 
 from .approach_cone import BESIDE_LINE_M
+from .approach_line import ApproachLine
 from .chaser_state import CommandResult
 from .phases import Phase
 
@@ -40,16 +40,24 @@ def why_unknown_chaser(chaser: int, chasers: int) -> str:
     )
 
 
-def why_not_along(scenario: FlightScenario, chaser: int, offset_m: Array) -> str:
-    """Check that a reference at ``offset_m`` (3,), TRF, is on the approach line through the nominal
-    offset.
-    """
-    nominal = np.asarray(scenario.chasers[chaser].position_m)
-    along = float(offset_m @ nominal) / math.hypot(*nominal)
-    aside = math.sqrt(max(0.0, float(offset_m @ offset_m) - along * along))
-    if along <= 0.0 or aside > BESIDE_LINE_M:
+def why_not_along(line: ApproachLine, offset_m: Array) -> str:
+    """Check that a reference at ``offset_m`` (3,), TRF, is on the approach line."""
+    aside = line.aside_m(offset_m)
+    if aside > BESIDE_LINE_M:
         return f"the reference is {aside:.2f} m beside the approach line; retreat or goto first"
     return ""
+
+
+def why_not_closed(scenario: FlightScenario, sighted: SightedMap | None) -> str:
+    """Check that the loop of the map of an unknown target has closed: before, nothing flies near
+    by it.
+    """
+    if not scenario.maps_target or (sighted is not None and sighted.closed):
+        return ""
+    return (
+        "the loop of the map is open: until a side of the target has returned its rate is wrong by "
+        "up to 1 %; wait"
+    )
 
 
 def why_not_calibrate(scenario: FlightScenario, phase: Phase, at_rest: bool) -> str:

@@ -15,6 +15,7 @@ from chaserdock_protocol.scenario.planar import why_not_planar
 from chaserdock_controller.interfaces import LogEntry
 
 from . import command_validation as validation
+from .approach_line import why_not_past
 from .chaser_machine import ChaserMachine
 from .chaser_state import ChaserTick, CommandResult, PhaseChange
 from .moves import MovePlanner
@@ -27,6 +28,7 @@ class ChaserFleet:
     """All ``chasers``, by number.
 
     ``changes``: their phase changes in this tick, in order. ``notes``: other log entries of it.
+    ``left``: numbers of the entries of ``timeline``, which is in order of time, still to come.
     """
 
     def __init__(self, scenario: FlightScenario) -> None:
@@ -36,7 +38,8 @@ class ChaserFleet:
         self.notes: list[LogEntry] = []
         numbers = range(len(scenario.chasers))
         self.chasers = tuple(ChaserMachine(scenario, i, self.changes) for i in numbers)
-        self._timeline = sorted(scenario.timeline, key=lambda entry: entry.at_s)
+        self.timeline = sorted(scenario.timeline, key=lambda entry: entry.at_s)
+        self.left = [k for k, entry in enumerate(self.timeline) if entry.port is None]
         self._pending_goals: dict[int, Array] = {}
         self._pending_inspections: set[int] = set()
         self._seen_s: float | None = None
@@ -90,19 +93,46 @@ class ChaserFleet:
 
     def due_commands(self, now_s: float) -> list[OperatorCommand]:
         """Return the commands of the scenario's timeline that have become due since the last
-        call.
+        call. Beside an unknown target, a command waits for the map, for its chaser's port and for
+        the way there, and so do later ones of the chaser.
         """
-        out = []
-        while self._timeline and self._timeline[0].at_s <= now_s + 1e-9:
-            entry = self._timeline.pop(0)
-            for chaser in entry.chasers:
-                fields = {
-                    "command": entry.command,
-                    "offset_m": entry.offset_m,
-                    "thruster": entry.thruster,
-                }
-                out.append(OperatorCommand(chaser=chaser, **fields))
+        out: list[OperatorCommand] = []
+        waiting: set[int] = set()
+        for k in tuple(self.left):
+            entry = self.timeline[k]
+            if entry.at_s > now_s + 1e-9:
+                break
+            commands = [
+                OperatorCommand(
+                    command=entry.command,  # type: ignore[arg-type]
+                    chaser=chaser,
+                    offset_m=entry.offset_m,
+                    thruster=entry.thruster,
+                )
+                for chaser in entry.chasers
+            ]
+            if self.scenario.maps_target:
+                waits = any(c.chaser in waiting or self._waits(c, now_s) for c in commands)
+                waiting.update(entry.chasers)
+                if waits:
+                    continue
+            self.left.remove(k)
+            out += commands
         return out
+
+    def _waits(self, command: OperatorCommand, now_s: float) -> bool:
+        """Return whether a command of the timeline waits for the map, or for the chaser."""
+        if command.command not in ("goto", "approach"):
+            return False
+        chaser = self.chasers[command.chaser]
+        if validation.why_not_closed(self.scenario, chaser.sighted):
+            return True
+        if command.command == "approach":
+            return chaser.phase in (Phase.SURVEY, Phase.GOTO)
+        if command.offset_m is not None or chaser.phase is not Phase.SURVEY:
+            return False
+        here_m = chaser.motion(now_s).at(np.array([now_s]))[0][0]
+        return chaser.port is None or bool(why_not_past(self.scenario, here_m, chaser.line.entry_m))
 
     def apply(self, commands: Sequence[OperatorCommand], now_s: float) -> list[CommandResult]:
         """Execute or refuse the commands of one tick. All goals are known in advance, so that two

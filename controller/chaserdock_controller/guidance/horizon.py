@@ -179,7 +179,8 @@ class ReferenceBuilder:
         c, state = self._scenario.chasers[chaser.number], chaser.state
         q = np.array(c.q_wxyz)
         if self._scenario.approach.face_target or state.faces:
-            q = facing_attitudes(c.position_m, c.q_wxyz, offsets, self._up)
+            away = offsets - chaser.line.base_m
+            q = facing_attitudes(c.position_m, c.q_wxyz, away, self._up)
         if state.turns:
             q = rotations.multiply(q, calibration_turns(times_s - state.since_s))
         if state.slew is None or state.slew.over_at(float(times_s[0])):

@@ -81,6 +81,8 @@ class GuidanceStage:
 
         for sighting in observation.sightings:
             fleet.chasers[sighting.chaser].unseen = sighting.detail
+            if sighting.map is not None:
+                fleet.chasers[sighting.chaser].sight_map(sighting.map, now_s)
         commands = (*fleet.due_commands(now_s), *observation.commands)
         for activity in self.activities:
             activity.observe(commands, observation, estimation)

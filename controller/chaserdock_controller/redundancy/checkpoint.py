@@ -12,7 +12,13 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
+from chaserdock_protocol.messages import (
+    ChosenPort,
+    Odometry,
+    OperatorCommand,
+    SightedMap,
+    ThrusterReport,
+)
 from msgspec import Struct
 
 from chaserdock_controller.bodies.mass_properties import MassProperties
@@ -58,6 +64,7 @@ class OutputState(Struct, forbid_unknown_fields=True):
 
 class FleetState(Struct, forbid_unknown_fields=True):
     _seen_s: float | None
+    left: list[int]
 
 
 class WaitingState(Struct, forbid_unknown_fields=True):
@@ -123,6 +130,8 @@ class MachineState(Struct, forbid_unknown_fields=True):
     abort_margin: float | None
     led_s: float | None
     unseen: str
+    sighted: SightedMap | None
+    port: ChosenPort | None
     _last_command: tuple[float, OperatorCommand] | None
 
 
@@ -191,9 +200,8 @@ _ESTIMATORS: dict[type, type[JointEstimatorState | PaperEstimatorState]] = {
 class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     """State of a controller after a tick.
 
-    ``timeline_left``: commands of the scenario's timeline that are not yet due. ``identification``:
-    None if the scenario does not identify. ``plans``: warm starts of the NMPC solver, inputs by
-    chaser.
+    ``identification``: None if the scenario does not identify. ``plans``: warm starts of the NMPC
+    solver, inputs by chaser.
     """
 
     core: CoreState
@@ -201,7 +209,6 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     output: OutputState
     chasers: list[ChaserCheckpoint]
     fleet: FleetState
-    timeline_left: int
     stack: WaitingState
     stack_control: StackControlState
     stack_plan: StackPlanState
@@ -288,7 +295,6 @@ class Checkpoint:
                         ChaserCheckpoint(**_read_all(self._chaser_parts(c.number)))
                         for c in self._core.guidance.chasers
                     ],
-                    timeline_left=len(vars(self._core.guidance.fleet)["_timeline"]),
                     identification=None if identification is None else identification.save(),
                     estimator=None if kind is None else _read(estimator, kind),
                     plans=dict(frame.plans) if frame is not None else {},
@@ -309,9 +315,9 @@ class Checkpoint:
             check_fit(state, self._core.scenario, OWN_ARRAYS)
         except MisfitError as error:
             raise CheckpointError(str(error)) from None
-        timeline = sorted(self._core.scenario.timeline, key=lambda entry: entry.at_s)
+        commands = range(len(self._core.scenario.timeline))
         chasers = len(self._core.scenario.chasers)
-        if len(state.chasers) != chasers or not 0 <= state.timeline_left <= len(timeline):
+        if len(state.chasers) != chasers or not set(state.fleet.left) <= set(commands):
             raise CheckpointError("the state is of another mission")
         count = (
             None
@@ -324,9 +330,8 @@ class Checkpoint:
         _write_all(self._parts(), state)
         for i, chaser in enumerate(state.chasers):
             _write_all(self._chaser_parts(i), chaser)
-        vars(self._core.guidance.fleet)["_timeline"] = timeline[
-            len(timeline) - state.timeline_left :
-        ]
+            machine = self._core.guidance.chasers[i]
+            machine.use_port(machine.port)
         kind = _ESTIMATORS.get(type(self._core.estimator))
         if state.estimator is not None and type(state.estimator) is kind:
             _write(self._core.estimator, state.estimator)

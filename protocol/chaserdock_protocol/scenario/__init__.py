@@ -6,6 +6,7 @@
 from .errors import ScenarioError
 from .flight import FlightScenario, flight_scenario, flight_scenario_from_json, flight_scenario_json
 from .loading import load_scenario, parse_scenario, scenario_from_json
+from .mapping import PortChoice
 from .mission import Scenario
 from .schema import ESTIMATORS, PERCEPTIONS, SOLVERS
 
@@ -14,6 +15,7 @@ __all__ = [
     "PERCEPTIONS",
     "SOLVERS",
     "FlightScenario",
+    "PortChoice",
     "Scenario",
     "ScenarioError",
     "flight_scenario",

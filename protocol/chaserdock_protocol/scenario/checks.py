@@ -59,6 +59,7 @@ def check_flight(scenario: FlightScenario) -> None:
     _check_detumble(scenario)
     _check_hold_points(scenario)
     _check_approach_cone(scenario)
+    _check_chosen_ports(scenario)
 
     if scenario.ranging is not None and scenario.perception.name not in MARKER_PERCEPTIONS:
         raise ValueError(
@@ -353,6 +354,35 @@ def _check_unknown_target(scenario: FlightScenario) -> None:
         raise ValueError("mapping.latency_s: shorter than the interval of the images")
     if scenario.limits.min_distance_shape_m:
         raise ValueError("limits.min_distance_shape_m: the shape of the target is unknown")
+
+
+def _check_chosen_ports(scenario: FlightScenario) -> None:
+    """Check that ports are chosen on unknown targets only, and that every `goto` has a goal."""
+    chosen: set[int] = set()
+    for entry in sorted(scenario.timeline, key=lambda entry: entry.at_s):
+        path = f"timeline.{scenario.timeline.index(entry)}"
+        if (
+            entry.command == "goto"
+            and entry.offset_m is None
+            and not chosen.issuperset(entry.chasers)
+        ):
+            raise ValueError(
+                f"{path}: offset_m goes with the command goto, and goto needs it unless a port "
+                "has been chosen for each of its chasers before"
+            )
+        if entry.port is None:
+            continue
+        chosen.update(entry.chasers)
+        if not scenario.maps_target:
+            raise ValueError(
+                f'{path}: ports are chosen on unknown targets only (perception.name = "features")'
+            )
+        distance_m, reach_m = scenario.approach.dock_distance_m, scenario.chaser.probe_reach_m
+        if distance_m <= reach_m:
+            raise ValueError(
+                f"approach.dock_distance_m: counts from the chosen port; {distance_m:g} m is not "
+                f"more than chaser.probe_reach_m ({reach_m:g} m)"
+            )
 
 
 def _check_named_chasers(scenario: FlightScenario) -> None:

@@ -113,6 +113,10 @@ class FlightScenario(Section):
         """Whether the target's shape is unknown to the flight software, which maps it."""
         return self.perception.name == MAPPING
 
+    def chooses_port(self, chaser: int) -> bool:
+        """Return whether the timeline chooses a port for a chaser, on a target of unknown shape."""
+        return any(e.port is not None and chaser in e.chasers for e in self.timeline)
+
     def camera_model(self) -> Camera:
         """Return the camera as calibrated."""
         return self.camera.model()

@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from .fields import Positive, Section
+from .fields import Index, NotNegative, Positive, Section, Vector
 
 WorkSeconds = Annotated[float, Field(ge=0.2, le=60, allow_inf_nan=False)]
 
@@ -41,3 +41,29 @@ class Mapping(Section):
         description="Age at which a map begins to count, s: longer than the work on it, so that "
         "in lock-step no tick waits.",
     )
+
+
+class PortChoice(Section):
+    """Where a port is to be on a target of unknown shape: `image` and `pixel`, or `point_m`, or
+    `find`.
+    """
+
+    image: Index | None = Field(
+        default=None, description="Number of the chaser in whose newest image `pixel` is."
+    )
+    pixel: tuple[NotNegative, NotNegative] | None = Field(
+        default=None, description="Column and row of the place in the image, from 0, px."
+    )
+    point_m: Vector | None = Field(
+        default=None, description="The place of the surface nearest to this one (TRF), m."
+    )
+    find: Literal["flat"] | None = Field(
+        default=None, description="`flat`: the best of all flat places with a free corridor."
+    )
+
+    @model_validator(mode="after")
+    def _check_one(self) -> PortChoice:
+        given = [self.pixel, self.point_m, self.find]
+        if sum(g is not None for g in given) != 1 or (self.pixel is None) != (self.image is None):
+            raise ValueError("needs either image and pixel, or point_m, or find")
+        return self

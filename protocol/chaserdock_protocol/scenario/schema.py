@@ -26,6 +26,7 @@ from .fields import (
     Vector,
     is_zero,
 )
+from .mapping import PortChoice
 
 MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
 MAPPING = "features"
@@ -276,7 +277,9 @@ class Approach(Section):
     """Approach to a distance, and when a chaser counts as docked with `docking.kind = "held"`."""
 
     dock_distance_m: Positive = Field(
-        default=0.40, description="Distance from the target's centre, m."
+        default=0.40,
+        description="Distance from the target's centre, m; from the chosen port on a target of "
+        "unknown shape.",
     )
     max_speed_m_s: Positive = Field(
         default=0.03,
@@ -339,27 +342,34 @@ class TimelineEntry(Section):
     """An operator command at a given time."""
 
     at_s: NotNegative = Field(description="Mission time, s.")
-    command: OperatorCommandName = Field(
+    command: Literal[OperatorCommandName, "port"] = Field(
         description="`approach`: dock. `hold`: stop at the present place. `retreat`: return to "
         "the reference position. `abort`: the same, twice as fast. `goto`: fly to "
         "`offset_m`. `calibrate`: manoeuvre to calibrate the camera. `inspect`: fly around "
         "the target and estimate its geometry. `identify`: fire pulses that show the mass "
         "properties of the stack. `detumble`: stop the target with latched chasers. "
-        "`isolate`, `restore`: close or open the shut-off valve of `thruster`."
+        "`isolate`, `restore`: close or open the shut-off valve of `thruster`. `port`: choose "
+        "a place on a target of unknown shape (`port`) to dock at."
     )
     chasers: tuple[Index, ...] = Field(min_length=1, description="Numbers of the chasers, from 0.")
-    offset_m: Vector | None = Field(default=None, description="Destination of `goto` (TRF), m.")
+    offset_m: Vector | None = Field(
+        default=None,
+        description="Destination of `goto` (TRF), m. Without it: before the chaser's chosen port.",
+    )
     thruster: int | None = Field(
         default=None,
         ge=0,
         le=254,
         description="Number of the thruster, from 0, for `isolate` and `restore`.",
     )
+    port: PortChoice | None = None
 
     @model_validator(mode="after")
     def _check_arguments(self) -> TimelineEntry:
-        if (self.command == "goto") != (self.offset_m is not None):
-            raise ValueError("offset_m goes with the command goto, and goto needs it")
+        if self.command != "goto" and self.offset_m is not None:
+            raise ValueError("offset_m goes with the command goto")
+        if (self.command == "port") != (self.port is not None):
+            raise ValueError("port goes with the command port, and that needs it")
         if (self.command in ("isolate", "restore")) != (self.thruster is not None):
             raise ValueError(
                 "thruster goes with the commands isolate and restore, and these need it"

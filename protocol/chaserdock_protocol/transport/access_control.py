@@ -31,6 +31,7 @@ QUERIES = (
         topics.SCENARIO_KEY, frozenset({"recorder", "operator", "analysis", "viewer"}), "world"
     ),
     QueryAccess(topics.OPERATE_KEY, frozenset({"operator", "viewer", "bridge"}), "controller"),
+    QueryAccess(topics.PORT_KEY, frozenset({"operator", "viewer", "bridge"}), "mapper"),
     QueryAccess(topics.THRUSTER_FAULT_KEY, frozenset({"operator"}), "world"),
     QueryAccess(topics.ARMING_KEY, frozenset({"operator"}), "world"),
 )

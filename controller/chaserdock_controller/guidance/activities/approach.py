@@ -7,7 +7,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import length
 from chaserdock_protocol.messages import OperatorCommand
 
 from .. import command_validation as validation
@@ -16,11 +16,9 @@ from ..chaser_state import Cause, ChaserGuidance, ChaserTick, TrackingErrors
 from ..phases import Phase, Trigger
 from ..trajectories import move_to
 
-
-def docked_offset_m(chaser: ChaserMachine) -> Array:
-    """Return the centre (3,), TRF, of a chaser at its docking distance."""
-    distance_m = chaser.scenario.approach.dock_distance_m
-    return chaser.nominal_m / np.linalg.norm(chaser.nominal_m) * distance_m
+_FOLLOWED_M = 0.0005
+"""Shift of a docked place with its port from which the reference follows, m: well below what a
+docked chaser may be off."""
 
 
 class ApproachActivity(Activity):
@@ -31,18 +29,23 @@ class ApproachActivity(Activity):
     def refuse(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> str:
         if reason := super().refuse(chaser, command, now_s):
             return reason
+        if reason := validation.why_not_closed(chaser.scenario, chaser.sighted):
+            return reason
         offset_m = chaser.motion(now_s).at(np.array([now_s]))[0][0]
-        return validation.why_not_along(chaser.scenario, chaser.number, offset_m)
+        return validation.why_not_along(chaser.line, offset_m)
 
     def enter(self, chaser: ChaserMachine, begun: ChaserGuidance, cause: Cause) -> ChaserGuidance:
         if cause.trigger in (Trigger.COMMAND_APPROACH, Trigger.SIGHT_REGAINED):
             speed = chaser.scenario.approach.max_speed_m_s
-            here, there = chaser.motion(cause.now_s), docked_offset_m(chaser)
+            here, there = chaser.motion(cause.now_s), chaser.line.docked_m
             return replace(begun, move=move_to(here, there, cause.now_s, speed))
         return replace(begun, inside_since_s=chaser.state.inside_since_s)
 
     def step(self, chaser: ChaserMachine, known: ChaserTick, errors: TrackingErrors) -> None:
         state, now_s, approach = chaser.state, known.now_s, chaser.scenario.approach
+        if length(chaser.line.docked_m - state.move.goal_m) > _FOLLOWED_M:  # its port has moved
+            move = move_to(state.move, chaser.line.docked_m, now_s, approach.max_speed_m_s)
+            state = chaser.state = replace(state, move=move)
         if not state.over_at(now_s):
             return
         inside = (

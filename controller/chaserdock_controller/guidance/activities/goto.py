@@ -6,14 +6,31 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from chaserdock_models.arrays import Array, length
 from chaserdock_protocol.messages import OperatorCommand
+from numpy.typing import ArrayLike
 
 from .. import command_validation as validation
+from ..approach_line import approach_line, why_not_past
 from ..chaser_machine import Activity, ChaserMachine
 from ..chaser_state import Cause, ChaserGuidance, ChaserTick, TrackingErrors
 from ..fleet import ChaserFleet
 from ..phases import Phase, Trigger
 from ..trajectories import move_to, stay
+
+_NEARER_M = 0.05
+"""A place nearer to the target than the chaser's reference position by more than this is near: a
+survey drifts less."""
+
+
+def goal_of(chaser: ChaserMachine, command: OperatorCommand) -> ArrayLike | None:
+    """Return where a `goto` leads (3,), TRF: without an offset, to the entry of the chaser's chosen
+    port; None without both.
+    """
+    sighted = chaser.sighted
+    if command.offset_m is not None or sighted is None or sighted.port is None:
+        return command.offset_m
+    return approach_line(chaser.scenario, chaser.number, sighted.port).entry_m
 
 
 class GotoActivity(Activity):
@@ -29,16 +46,29 @@ class GotoActivity(Activity):
         if chaser.in_corridor():
             return "the chaser is in its corridor: retreat or abort first"
         scenario, i = chaser.scenario, chaser.number
-        goals_m = self._fleet.goals_besides(chaser)
-        if reason := validation.why_not_goto(scenario, i, command.offset_m, goals_m):
+        goals_m, wanted_m = self._fleet.goals_besides(chaser), goal_of(chaser, command)
+        if reason := validation.why_not_goto(scenario, i, wanted_m, goals_m):
             return reason
-        goal_m = np.asarray(command.offset_m)
+        goal_m = np.asarray(wanted_m)
+        if length(goal_m) < length(chaser.nominal_m) - _NEARER_M and (
+            reason := validation.why_not_closed(scenario, chaser.sighted)
+        ):
+            return reason
+        if command.offset_m is None and (reason := self._why_not_to_port(chaser, goal_m, now_s)):
+            return reason
         return validation.why_not_in_cone(scenario, i, goal_m) or self._fleet.moves.why_not_safe(
             chaser, goal_m, now_s
         )
 
     def start(self, chaser: ChaserMachine, command: OperatorCommand, now_s: float) -> None:
-        chaser.fire(Trigger.COMMAND_GOTO, now_s, place_m=np.asarray(command.offset_m))
+        goal_m = np.asarray(goal_of(chaser, command))
+        if (sighted := chaser.sighted) is not None and sighted.port is not None:
+            chaser.use_port(sighted.port)
+        chaser.fire(Trigger.COMMAND_GOTO, now_s, place_m=goal_m)
+
+    def _why_not_to_port(self, chaser: ChaserMachine, goal_m: Array, now_s: float) -> str:
+        here_m = chaser.motion(now_s).at(np.array([now_s]))[0][0]
+        return why_not_past(chaser.scenario, here_m, goal_m)
 
     def enter(self, chaser: ChaserMachine, begun: ChaserGuidance, cause: Cause) -> ChaserGuidance:
         """Begin the commanded move. A chaser that has searched flies from its present place to its

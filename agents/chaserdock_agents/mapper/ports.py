@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Choose where chasers are to dock on a mapped target, and keep these places on it while the map
+improves. No I/O; TRF of the map, SI units.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, Protocol
+
+import msgspec
+import numpy as np
+from chaserdock_models.arrays import Array, IntArray
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import ChosenPort
+from chaserdock_protocol.scenario import FlightScenario
+
+from .docking_site import (
+    DockingSite,
+    SiteLimits,
+    judged_site,
+    landmarks_near,
+    plane_near,
+    site_on_ray,
+)
+from .surface import MappedSurface, SightLines, surface_of
+
+_CELL_M = 0.06
+"""Edge of the cells of which each offers one place to a search, m: half the radius of a place."""
+_ANCHORS = 3
+"""Landmarks near a port that two maps must share, so that it follows them."""
+_MOST_CLEARANCE_M = 10.0
+"""Clearance that is stated of a place in front of which there is nothing, m."""
+_FULL_LANDMARKS = 20
+"""Landmarks of a place beyond which more do not make it better: its normal is then known to a
+fifth of that of one landmark."""
+_PROPOSALS = 3
+"""Places that the answer to a search names."""
+
+
+class Where(Protocol):
+    """What of a request or of the timeline says where a port is to be."""
+
+    @property
+    def point_m(self) -> tuple[float, float, float] | None: ...
+    @property
+    def find(self) -> Literal["flat"] | None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class MappedPoints:
+    """Landmarks of a map: ``keys`` (n,), ascending, places (n, 3) with covariances (n, 3, 3), and
+    lines of sight to them. The surface is made when it is asked for.
+    """
+
+    keys: IntArray
+    landmarks_m: Array
+    covariances_m2: Array
+    sights: SightLines
+
+    @cached_property
+    def surface(self) -> MappedSurface | None:
+        """The surface; None of too few landmarks."""
+        return surface_of(self.landmarks_m, self.covariances_m2, self.sights)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Whether a place became a port, and the answer to who asked: its figures, or why not."""
+
+    accepted: bool
+    answer: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Held:
+    """A port with the keys (k,) and places (k, 3) of the landmarks near it, in the last map."""
+
+    port: ChosenPort
+    keys: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    landmarks_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+
+class PortChooser:
+    """Holds at most one port for each chaser. All methods may be called on any thread."""
+
+    def __init__(self, scenario: FlightScenario) -> None:
+        self._scenario = scenario
+        self._limits = site_limits(scenario)
+        self._held: dict[int, _Held] = {}
+        self._points: MappedPoints | None = None
+        self._chosen = 0
+        self._lock = threading.Lock()
+
+    def follow(self, points: MappedPoints) -> None:
+        """Take a new map; the ports move with the landmarks near them."""
+        with self._lock:
+            self._points = points
+            self._held = {i: _moved(held, points) for i, held in self._held.items()}
+
+    def ports(self) -> tuple[ChosenPort, ...]:
+        """Return the ports by the last map."""
+        with self._lock:
+            return tuple(held.port for _, held in sorted(self._held.items()))
+
+    def decide(self, chaser: int, where: Where, ray: tuple[Array, Array] | None) -> Decision:
+        """Judge a place by the last map; make it the chaser's port if nothing is against it.
+
+        ``ray``: origin and direction (3,) of a line of sight, for a request by a pixel.
+        """
+        with self._lock:
+            if reason := self._why_impossible(chaser):
+                return Decision(False, reason)
+            points = self._points
+            surface = None if points is None else points.surface
+            if points is None or surface is None:
+                return Decision(False, "there is no surface: the map has too few landmarks")
+            if where.find is not None:
+                return self._found(chaser, points, surface)
+            if ray is not None:
+                site = self._on_ray(ray, points, surface)
+            else:
+                assert where.point_m is not None
+                site = self._nearest(np.array(where.point_m), points, surface)
+            if site is None:
+                return Decision(False, "the line of sight does not meet the target")
+            return self._decided(chaser, site, points)
+
+    def _why_impossible(self, chaser: int) -> str:
+        """Return why this chaser cannot have a port at all; empty if it can."""
+        scenario, count = self._scenario, len(self._scenario.chasers)
+        if chaser >= count:
+            return f"there is no chaser {chaser}; this mission has 0 to {count - 1}"
+        distance_m, reach_m = scenario.approach.dock_distance_m, scenario.chaser.probe_reach_m
+        if distance_m <= reach_m:
+            return (
+                f"approach.dock_distance_m ({distance_m:g} m) counts from the port; it must be "
+                f"more than chaser.probe_reach_m ({reach_m:g} m)"
+            )
+        return ""
+
+    def _on_ray(
+        self, ray: tuple[Array, Array], points: MappedPoints, surface: MappedSurface
+    ) -> DockingSite | None:
+        return site_on_ray(*ray, surface, points.landmarks_m, points.covariances_m2, self._limits)
+
+    def _nearest(self, at_m: Array, points: MappedPoints, surface: MappedSurface) -> DockingSite:
+        """Judge the place of the surface that is nearest to a point, by the middles of faces."""
+        face = int(np.argmin(np.linalg.norm(_middles(surface) - at_m, axis=1)))
+        return self._judged([face], points, surface)[0]
+
+    def _judged(
+        self, faces: Iterable[int], points: MappedPoints, surface: MappedSurface
+    ) -> list[DockingSite]:
+        """Judge the middles of faces."""
+        middles, normals = _middles(surface), surface.normals()
+        known = surface, points.landmarks_m, points.covariances_m2, self._limits
+        return [judged_site(middles[k], normals[k], *known, bool(surface.seen[k])) for k in faces]
+
+    def _found(self, chaser: int, points: MappedPoints, surface: MappedSurface) -> Decision:
+        """Return the decision for the best place of a search over the surface."""
+        judged = self._judged(_candidates(surface), points, surface)
+        good = [s for s in judged if not self._why_not(chaser, s)]
+        if not good:
+            return Decision(False, f"none of {len(judged)} places will do")
+        best = sorted(good, key=lambda s: -score(s, self._limits))[:_PROPOSALS]
+        decision = self._decided(chaser, best[0], points)
+        others = "; ".join(
+            f"{_text(s.position_m)} m, score {score(s, self._limits):.2f}" for s in best[1:]
+        )
+        of = f"; {len(good)} of {len(judged)} places will do"
+        return replace(decision, answer=decision.answer + of + (f", next: {others}" * bool(others)))
+
+    def _decided(self, chaser: int, site: DockingSite, points: MappedPoints) -> Decision:
+        figures = (
+            f"({_text(site.position_m)}) m, normal ({_text(site.normal)}) within "
+            f"{math.degrees(min(site.normal_sigma_rad, math.pi)):.2g} degrees, "
+            f"{site.landmarks} landmarks"
+        )
+        if math.isfinite(site.flatness_m):
+            figures += f" {site.flatness_m * 1e3:.1f} mm (RMS) from their plane"
+        room_m = min(site.clearance_m, _MOST_CLEARANCE_M)
+        figures += f", {room_m:.2f} m of room beside the corridor"
+        if why := self._why_not(chaser, site):
+            return Decision(False, f"{'; '.join(why)}: {figures}")
+        self._chosen += 1
+        port = ChosenPort(
+            chaser=chaser,
+            number=self._chosen,
+            position_m=vector(site.position_m),
+            axis=vector(site.normal),
+            axis_sigma_rad=site.normal_sigma_rad,
+            flatness_m=site.flatness_m,
+            clearance_m=room_m,
+        )
+        self._held[chaser] = _anchored(port, points)
+        return Decision(True, f"{figures}, score {score(site, self._limits):.2f}")
+
+    def _why_not(self, chaser: int, site: DockingSite) -> tuple[str, ...]:
+        """Return the reasons against a place for a chaser, those of reach included."""
+        why, at, axis = list(site.why_not), site.position_m, site.normal
+        if float(at @ axis) <= 0.0:
+            why.append("it faces the middle of the target")
+        least_m = self._scenario.limits.min_distance_chasers_m
+        place = self._docked_m(at, axis)
+        for other, held in self._held.items():
+            there = self._docked_m(np.array(held.port.position_m), np.array(held.port.axis))
+            apart_m = float(np.linalg.norm(place - there))
+            if other != chaser and apart_m < least_m:
+                why.append(
+                    f"docked there, the chaser is {apart_m:.2f} m from chaser {other} at its port; "
+                    f"at least {least_m:g} m"
+                )
+        return tuple(why)
+
+    def _docked_m(self, at_m: Array, axis: Array) -> Array:
+        return at_m + self._scenario.approach.dock_distance_m * axis
+
+
+def site_limits(scenario: FlightScenario) -> SiteLimits:
+    """Return what a place must offer to the chasers of a scenario.
+
+    The corridor reaches from the docked chaser's front to where chasers keep their distance.
+    """
+    body = scenario.chaser.boxes()[0]
+    length_m, *across_m = body.size_m
+    docked_m = scenario.approach.dock_distance_m
+    return SiteLimits(
+        corridor_m=max(docked_m, scenario.limits.min_distance_target_m),
+        corridor_half_angle_rad=math.radians(scenario.docking.corridor_angle_deg),
+        radius_m=float(np.hypot(*across_m)) / 2.0,
+        reach_m=max(docked_m - length_m / 2.0, 0.0),
+    )
+
+
+def score(site: DockingSite, limits: SiteLimits) -> float:
+    """Return how good a place is, 0 to 1: the product of what is left of the limits of flatness and
+    normal, of the room beside the corridor and of the number of landmarks, as shares, and of the
+    cosine between its normal and the direction away from the middle of the target.
+    """
+    at = site.position_m
+    outward = float(at @ site.normal) / max(float(np.linalg.norm(at)), 1e-9)
+    shares = (
+        1.0 - site.flatness_m / limits.flatness_m,
+        1.0 - site.normal_sigma_rad / limits.normal_rad,
+        min(1.0, site.clearance_m / limits.radius_m),
+        min(1.0, site.landmarks / _FULL_LANDMARKS),
+        outward,
+    )
+    return float(np.prod([max(0.0, s) for s in shares]))
+
+
+def _middles(surface: MappedSurface) -> Array:
+    return surface.vertices_m[surface.triangles].mean(axis=1)
+
+
+def _candidates(surface: MappedSurface) -> list[int]:
+    """Return faces that were seen, one whose middle is in each cell."""
+    seen = np.flatnonzero(surface.seen)
+    cells = np.floor(_middles(surface)[seen] / _CELL_M)
+    return np.sort(seen[np.unique(cells, axis=0, return_index=True)[1]]).tolist()
+
+
+def _anchored(port: ChosenPort, points: MappedPoints) -> _Held:
+    near = landmarks_near(np.array(port.position_m), points.landmarks_m)
+    return _Held(port, points.keys[near], points.landmarks_m[near])
+
+
+def _moved(held: _Held, points: MappedPoints) -> _Held:
+    """Return a port in a new map: moved by the mean of the landmarks near it, then into the plane
+    of those that are near it now.
+    """
+    port = held.port
+    _, before, now = np.intersect1d(held.keys, points.keys, assume_unique=True, return_indices=True)
+    at, axis = np.array(port.position_m), np.array(port.axis)
+    if len(now) >= _ANCHORS:
+        at = at + np.median(points.landmarks_m[now] - held.landmarks_m[before], axis=0)
+    found = plane_near(at, axis, points.landmarks_m, points.covariances_m2)
+    if found is not None:
+        plane, near, _ = found
+        at = at - float(plane.distances(at[None])[0]) * plane.normal
+        changes = {
+            "axis": vector(plane.normal),
+            "axis_sigma_rad": min(plane.normal_sigma_rad, math.pi),
+            "flatness_m": float(np.sqrt(np.mean(plane.distances(near) ** 2))),
+        }
+    else:
+        changes = {}
+    return _anchored(msgspec.structs.replace(port, position_m=vector(at), **changes), points)
+
+
+def _text(values: Array) -> str:
+    return ", ".join(f"{v:.3f}" for v in values)

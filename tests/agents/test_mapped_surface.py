@@ -277,9 +277,18 @@ def test_a_port_becomes_that_of_its_chaser_and_follows_the_map() -> None:
     shift = np.array([0.01, -0.02, 0.015])
     ports.follow(points_of(turn, shift, seed=6))
     (moved,) = ports.ports()
+    # Fewer landmarks, of which some stray, do not turn it.
+    whole = points_of(turn, shift, seed=7)
+    few = whole.landmarks_m[::6] + 0.008 * np.random.default_rng(8).normal(
+        size=(len(whole.keys[::6]), 3)
+    )
+    ports.follow(MappedPoints(whole.keys[::6], few, whole.covariances_m2[::6], whole.sights))
+    assert ports.ports()[0].axis == moved.axis
+    assert 0.0 < np.linalg.norm(np.subtract(ports.ports()[0].position_m, moved.position_m)) < 0.02
     assert moved.number == 1
     assert np.linalg.norm(moved.position_m - turn @ port.position_m - shift) < 0.003
     assert np.degrees(np.arccos(np.dot(moved.axis, turn @ port.axis))) < 0.5
+    ports.follow(whole)
     assert ports.decide(1, PortChoice(point_m=(0.3, 0.05, -0.1)), None).accepted
     assert ports.ports()[0].number == 2
 

@@ -118,7 +118,7 @@ def test_a_port_is_where_the_map_that_counts_says() -> None:
     at, axis = ports_at(maps, 4.0, PORT.chaser, times)
     before, first, last = np.zeros(3), np.array(PORT.position_m), np.array(moved.position_m)
     assert np.array_equal(at, [before, before, first, first, last, last])
-    assert np.array_equal(axis[:3], [before, before, PORT.axis])
+    assert np.array_equal(axis[:3], [before, before, np.array(PORT.axis)])
     assert not ports_at(maps, 4.0, 0, times)[1].any()
 
 

@@ -227,12 +227,12 @@ def site_limits(scenario: FlightScenario) -> SiteLimits:
     The corridor reaches from the docked chaser's front to where chasers keep their distance.
     """
     body = scenario.chaser.boxes()[0]
-    length_m, *across_m = body.size_m
+    length_m, width_m, height_m = body.size_m
     docked_m = scenario.approach.dock_distance_m
     return SiteLimits(
         corridor_m=max(docked_m, scenario.limits.min_distance_target_m),
         corridor_half_angle_rad=math.radians(scenario.docking.corridor_angle_deg),
-        radius_m=float(np.hypot(*across_m)) / 2.0,
+        radius_m=math.hypot(width_m, height_m) / 2.0,
         reach_m=max(docked_m - length_m / 2.0, 0.0),
     )
 
@@ -271,8 +271,9 @@ def _anchored(port: ChosenPort, points: MappedPoints) -> _Held:
 
 
 def _moved(held: _Held, points: MappedPoints) -> _Held:
-    """Return a port in a new map: moved by the mean of the landmarks near it, then into the plane
-    of those that are near it now.
+    """Return a port in a new map: moved by the median of the landmarks near it, then into the plane
+    of those that are near it now if that is as well known as the plane before. Once a chaser is
+    near, it sees few of them, of which a plane turns by degrees.
     """
     port = held.port
     _, before, now = np.intersect1d(held.keys, points.keys, assume_unique=True, return_indices=True)
@@ -280,12 +281,12 @@ def _moved(held: _Held, points: MappedPoints) -> _Held:
     if len(now) >= _ANCHORS:
         at = at + np.median(points.landmarks_m[now] - held.landmarks_m[before], axis=0)
     found = plane_near(at, axis, points.landmarks_m, points.covariances_m2)
-    if found is not None:
+    if found is not None and found[0].normal_sigma_rad <= port.axis_sigma_rad:
         plane, near, _ = found
         at = at - float(plane.distances(at[None])[0]) * plane.normal
         changes = {
             "axis": vector(plane.normal),
-            "axis_sigma_rad": min(plane.normal_sigma_rad, math.pi),
+            "axis_sigma_rad": plane.normal_sigma_rad,
             "flatness_m": float(np.sqrt(np.mean(plane.distances(near) ** 2))),
         }
     else:

@@ -9,6 +9,7 @@ made by commands that stand beside them, those of the camera by make_camera_imag
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import subprocess
 import sys
@@ -76,6 +77,9 @@ settling_s = 15.0
 "truth.preset" = "mismatch"
 "success.steady_position_rms_m" = 0.0035
 """
+
+LEAST_EPISODES = 200
+"""Episodes of a batch from which on it is in the training curve: a mean of fewer is noise."""
 
 logs = ROOT / "runs" / "images"
 
@@ -949,6 +953,27 @@ def learning() -> None:
     write("learning", np.hstack(tiles))
 
 
+def learning_curve() -> None:
+    """Episodes of each batch while the policy of the example was trained, as it was recorded."""
+    text = (ROOT / "examples" / "learning" / "docking-curve.json").read_text("utf-8")
+    batches = [b for b in json.loads(text) if b["episodes"] >= LEAST_EPISODES]
+    steps = [b["steps"] / 1e6 for b in batches]
+    shown = (
+        ("return", "return", 1.0), ("duration_s", "duration / s", 1.0),
+        ("success", "success / %", 100.0),
+    )  # fmt: skip
+    with styled():
+        figure = Figure(figsize=(6.4, 4.6))
+        rows = figure.subplots(3, 1, sharex=True)
+        for axes, shade, (name, label, scale) in zip(rows, SERIES, shown, strict=False):
+            values = [scale * b[name] for b in batches]
+            axes.plot(steps, values, ".", color=shade, markersize=3)
+            axes.set(ylabel=label)
+        took_min = batches[-1]["cpu_s"] / 60.0
+        rows[-1].set(xlabel=f"million steps ({took_min:.0f} min of processor time)")
+        save(figure, "learning-curve")
+
+
 def write(name: str, image: np.ndarray) -> None:
     """Write grey levels, or colours (BGR), as docs/images/NAME.webp."""
     cv2.imwrite(str(IMAGES / f"{name}.webp"), image, [cv2.IMWRITE_WEBP_QUALITY, 80])
@@ -1042,7 +1067,7 @@ PICTURES: dict[str, Callable[[], None]] = {
     "unknown-target": unknown,
     "results": results, "reproduction-curves": reproduction, "thrusters": thrusters,
     "targets": targets, "track": tracked, "dataset": dataset, "report": report,
-    "campaign": campaign, "learning": learning,
+    "campaign": campaign, "learning": learning, "learning-curve": learning_curve,
     "terminal": first_flight, "status": log_info,
 }  # fmt: skip
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -161,3 +162,27 @@ class ByHand:
             process.wait()
             if process.stdout is not None:
                 process.stdout.close()
+
+
+def install_example(example: Path, folder: Path) -> dict[str, str]:
+    """Puts an example's module and entry points into ``folder``; the environment that finds them
+    there.
+
+    What ``pip install --no-deps --target`` does, without the build back end, which is not at hand
+    off line.
+    """
+    project = tomllib.loads((example / "pyproject.toml").read_text())
+    for name in project["tool"]["hatch"]["build"]["targets"]["wheel"]["include"]:
+        (folder / name).write_bytes((example / name).read_bytes())
+    name, version = project["project"]["name"], project["project"]["version"]
+    info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    groups = project["project"]["entry-points"]
+    lines = [
+        line
+        for group, names in groups.items()
+        for line in (f"[{group}]", *(f"{k} = {v}" for k, v in names.items()))
+    ]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    return {"PYTHONPATH": str(folder)}

@@ -103,8 +103,11 @@ class DockingBatch:
                 for k in range(self.environments)
             )
             self._arrays["random"][:] = np.fromiter(words, np.uint64, self.environments)
-        self._arrays["done"][:] = True if chosen is None else chosen
+        done = self._arrays["done"]
+        waiting = np.zeros_like(done) if chosen is None else done & ~chosen  # for their next step
+        done[:] = True if chosen is None else chosen
         self._start(byref(self.task.numbers), byref(self._state))
+        done |= waiting
         return self._arrays["observations"].copy()
 
     def step(self, actions: NDArray[np.floating]) -> BatchStep:

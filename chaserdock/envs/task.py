@@ -16,7 +16,6 @@ import numpy as np
 from chaserdock_controller.guidance.approach_cone import cone_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, IntArray
-from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_models.native import location
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.thruster_model import ThrusterDynamics, Valves
@@ -32,6 +31,7 @@ from chaserdock_world.plant import Plant, actuation_errors, chaser_plant, target
 
 from ..analysis.criteria import nearest_allowed_m
 from .native import LIBRARY
+from .observation import goal_of, names_of
 from .sensor_errors import BINS, sensor_table
 
 PLANTS = 256
@@ -134,11 +134,14 @@ class TaskNumbers(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class TrainingTask:
-    """A scenario's training task. ``numbers`` points into ``kept``."""
+    """A scenario's training task. ``numbers`` points into ``kept``. ``effort_N_s`` (actuators,):
+    impulse of a tick at level 1, 0 for torques.
+    """
 
     scenario: Scenario
     learning: LearningSection
     numbers: TaskNumbers
+    effort_N_s: Array
     kept: tuple[object, ...]
 
     @property
@@ -191,7 +194,7 @@ def task_of(scenario: Scenario, environments: int) -> TrainingTask:
         timing.steps_per_tick, timing.latency_steps, round(learning.episode_s * timing.rate_hz),
         max(1, round(approach.docked_time_s * timing.rate_hz)), timing.ticks_per_image,
         len(target_plants), len(solids), len(sensor), TASKS.index(kind),
-        learning.observation == "statistical", 16 + 3 * (chasers - 1),
+        learning.observation == "statistical", len(names_of(chasers)),
         step_s, tick_s, scenario.chaser.probe_reach_m, _c([s / 2 for s in scenario.chaser.size_m]),
         scenario.limits.min_distance_target_m, scenario.limits.min_distance_chasers_m,
         scenario.limits.max_reference_distance_m, FASTEST_TURN_RAD / step_s,
@@ -205,7 +208,7 @@ def task_of(scenario: Scenario, environments: int) -> TrainingTask:
         _c(_state13(target)), _c(camera.position_crf_m), _c(camera.q_crf_irf_wxyz),
         _c([left, top, right, bottom]), distances_m[0], distances_m[1] - distances_m[0], *pointers,
     )  # fmt: skip
-    return TrainingTask(scenario, learning, numbers, (places, *arrays))
+    return TrainingTask(scenario, learning, numbers, effort, (places, *arrays))
 
 
 def _padded(count: int) -> int:
@@ -260,9 +263,7 @@ def _place(scenario: Scenario, chaser: int, kind: str) -> _Place:
     port = scenario.docking.port_of(chaser)
     nominal = np.asarray(stated.position_m)
     axis = nominal / np.linalg.norm(nominal)
-    goal = nominal if kind == "hold" else axis * scenario.approach.dock_distance_m
-    if kind == "latch" and port is not None:
-        goal = centre_offset(port, scenario.chaser.probe_reach_m, 0.0)
+    goal = goal_of(scenario, chaser, kind).position_m
     cone = (axis, 0.0, 0.0, 1.0)
     nearest_m = limit_m
     if kind != "hold":

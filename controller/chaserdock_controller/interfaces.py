@@ -384,6 +384,7 @@ class HorizonReference:
     provides (shapes there).
 
     ``attached``: chasers whose latch holds the target. They are obstacles that follow its motion.
+    ``docking``: rows of the chasers on their way to dock.
     """
 
     chasers: tuple[int, ...]
@@ -395,6 +396,7 @@ class HorizonReference:
     attached: frozenset[int]
     boxes: Array | None = None
     box_clearance_m: Array | None = None
+    docking: tuple[int, ...] = ()
 
 
 class GuidanceResult(Struct, frozen=True):

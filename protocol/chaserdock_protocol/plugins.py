@@ -78,6 +78,22 @@ def make(kind: Kind, name: str, own: tuple[str, ...], *arguments: Any) -> Any:
     return part
 
 
+def prepare(kind: Kind, name: str, part: Any, *arguments: Any) -> None:
+    """Call ``part.prepare(*arguments)``, if the part has it. Raises PluginError if that raises
+    another error than a ChaserdockError.
+    """
+    if not hasattr(part, "prepare"):
+        return
+    try:
+        part.prepare(*arguments)
+    except ChaserdockError:
+        raise
+    except Exception as error:  # a plugin may raise anything
+        raise PluginError(
+            f"{kind} {name!r} does not start: {type(error).__name__}: {error}"
+        ) from error
+
+
 def load(kind: Kind, name: str, own: tuple[str, ...]) -> Callable[..., Any]:
     """Return the factory that an installed package provides as ``name``. Raises PluginError, also
     if its import fails.

@@ -628,3 +628,18 @@ def test_a_chaser_without_port_cannot_dock_by_capture() -> None:
         ScenarioError, match=r"learning\.task: chasers 1, 2 have no port to dock at"
     ):
         parse_scenario(values, "test")
+
+
+def test_what_is_done_starts_anew_also_if_another_one_is_started_before() -> None:
+    scenario = docking(episode_s=0.4)
+    batches = [DockingBatch(scenario, 2) for _ in range(2)]
+    levels = np.full((2, 1, batches[0].task.actuators), 0.3)
+    for batch in batches:
+        batch.start(3)
+        while not batch.step(levels).truncated[0, 0]:
+            pass
+    batches[1].start(chosen=np.array([False, True]))
+    one, other = (batch.step(levels) for batch in batches)
+    assert other.outcomes[0, 0] == 0
+    np.testing.assert_array_equal(other.observations[0], one.observations[0])
+    assert not np.array_equal(other.observations[1], one.observations[1])

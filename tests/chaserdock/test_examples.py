@@ -16,7 +16,6 @@ import subprocess
 import sys
 import threading
 import time
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,36 +31,12 @@ from chaserdock_agents.gateway.devices import (
 from chaserdock_controller.estimation.estimators import make_estimator
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import load_scenario
-from harness import ROOT, ByHand, finished, run, sets, summary
+from harness import ROOT, ByHand, finished, install_example, run, sets, summary
 from joint_cases import SyntheticFlight, navigation
 
 EXAMPLES = ROOT / "examples"
 FOREIGN = EXAMPLES / "foreign_controller" / "foreign_controller.py"
 SHORT = ("duration_s=30.0", "settling_s=22.0", "camera.width_px=640", "camera.height_px=360")
-
-
-def install(example: Path, folder: Path) -> dict[str, str]:
-    """Puts an example's module and entry points into ``folder``; the environment that finds them
-    there.
-
-    What ``pip install --no-deps --target`` does, without the build back end, which is not at hand
-    off line.
-    """
-    project = tomllib.loads((example / "pyproject.toml").read_text())
-    for name in project["tool"]["hatch"]["build"]["targets"]["wheel"]["include"]:
-        (folder / name).write_text((example / name).read_text())
-    name, version = project["project"]["name"], project["project"]["version"]
-    info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-    groups = project["project"]["entry-points"]
-    lines = [
-        line
-        for group, names in groups.items()
-        for line in (f"[{group}]", *(f"{k} = {v}" for k, v in names.items()))
-    ]
-    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
-    return {"PYTHONPATH": str(folder)}
 
 
 @pytest.mark.slow
@@ -83,7 +58,7 @@ def install(example: Path, folder: Path) -> dict[str, str]:
 def test_plugin_flies_to_success(example: str, part: tuple[str, ...], tmp_path: Path) -> None:
     parts = tmp_path / "parts"
     parts.mkdir()
-    env = install(EXAMPLES / example, parts)
+    env = install_example(EXAMPLES / example, parts)
     status, said = run("single", tmp_path / "run", *SHORT, *part, env=env, arguments=["--quiet"])
     assert status == 0, said
     assert summary(tmp_path / "run")["success"]
@@ -99,7 +74,7 @@ def test_missing_plugin_is_named(tmp_path: Path) -> None:
 @pytest.fixture
 def udp_driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
     """Install the driver; return the socket of its robot."""
-    install(EXAMPLES / "own_driver", tmp_path)
+    install_example(EXAMPLES / "own_driver", tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
         robot.settimeout(30.0)

@@ -21,6 +21,7 @@ from chaserdock_controller.interfaces import HorizonReference, RelativePose, Tar
 from . import reference
 from .approach_cone import corridor_rows
 from .chaser_machine import ChaserMachine
+from .phases import DOCKING
 from .pointing import calibration_turns
 from .trajectories import Escape
 
@@ -139,6 +140,7 @@ class ReferenceBuilder:
             attached=attached,
             boxes=boxes,
             box_clearance_m=clearance,
+            docking=tuple(row for row, c in enumerate(chasers) if c.phase in DOCKING),
         )
 
     def _offsets(

@@ -96,6 +96,8 @@ ATTACHED = (_P.LATCHED, _P.VERIFIED, _P.IDENTIFY, *DETUMBLING)
 """Phases of a chaser whose latch holds the target."""
 APPROACHING = (_P.WAIT, *CORRIDOR, *ATTACHED, _P.DOCKED)
 """Phases that an ``approach`` command leads through."""
+DOCKING = (*CORRIDOR, _P.DOCKED)
+"""Phases of a chaser on its way to dock, or that stays docked at a distance."""
 BACKING_OUT = (_P.RETREAT, _P.ABORT)
 """Phases in which a chaser leaves its port or the vicinity of the target."""
 _MOVING = (*BACKING_OUT, _P.GOTO)

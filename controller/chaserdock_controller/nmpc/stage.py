@@ -9,9 +9,10 @@ from typing import cast
 
 import numpy as np
 from chaserdock_models.arrays import Array, limited
+from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.shape_distance import box_table
 from chaserdock_protocol.failure_watch import FailureWatch, text_of
-from chaserdock_protocol.plugins import PluginError
+from chaserdock_protocol.plugins import PluginError, prepare
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import (
@@ -28,6 +29,7 @@ from chaserdock_controller.interfaces import (
     PlanResult,
     SolveStatus,
     TargetEstimation,
+    TargetState,
 )
 
 from . import make_solver
@@ -94,6 +96,7 @@ class PlanningStage:
         if scenario.limits.min_distance_shape_m > 0.0:
             self._shape = box_table(scenario.chaser.boxes())
         self.solver = make_solver(c.solver, parameters, len(scenario.chasers), c.max_iterations)
+        prepare("solver", c.solver, self.solver, scenario)
         self.monitors = tuple(PlanMonitor() for _ in scenario.chasers)
         self._passive_safety = None
         if scenario.limits.passive_safety != "off":
@@ -135,6 +138,7 @@ class PlanningStage:
         # The solver sees the input plus the disturbance: leave the actuators room to cancel it.
         states = np.array([m.at_effect for m in own])
         problem = self.problem(horizon, states, limits - np.abs(disturbances))
+        problem = replace(problem, target=_motion(estimation.at_effect))
         lost = {c.chaser: c.lost for c in observation.chasers if c.lost is not None}
         problem = with_lost_chasers(
             problem, self._parameters, tuple(lost.values()), observation.effective_ns
@@ -240,6 +244,7 @@ class PlanningStage:
             corridors=horizon.corridors,
             boxes=horizon.boxes,
             box_clearance_m=horizon.box_clearance_m,
+            docking=horizon.docking,
             chaser_shape=self._shape,
             min_distance_shapes_m=self._between_shapes(horizon.box_clearance_m),
         )
@@ -263,6 +268,13 @@ def _own(estimate: ChaserEstimate) -> OwnMotion:
     """Return the motion of a chaser that is planned for, which is known."""
     assert estimate.own is not None
     return estimate.own
+
+
+def _motion(target: TargetState | None) -> BodyState | None:
+    """Return the motion of an estimated target."""
+    if target is None:
+        return None
+    return BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
 
 
 def _solve(plan: NmpcPlan, row: int) -> SolveStatus:

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.passive_safety import CoastCertificate, CoastModel, DisturbedMotion
+from chaserdock_models.rigid_body import BodyState
 
 INTEGRATORS = ("rk4", "euler")
 
@@ -63,6 +64,9 @@ class NmpcInput:
         linearizes it about its start into coasts.
     coasts (N, D+1, C, 7): half-spaces a' p + b' v >= d of position and velocity at a stage,
         [a (3), b (3), d]; a and b are zero for none (`terms.coast`).
+    target: estimated motion of the target at stage 0; None in a problem without a mission. Back
+        ends need no more of it than is stated above; solvers that are installed may.
+    docking: rows of the chasers on their way to dock.
 
     Only the back end `rti` keeps distances from cuboids and between shapes, and passive safety.
     """
@@ -81,6 +85,8 @@ class NmpcInput:
     min_distance_shapes_m: Array | None = None
     coast_safety: CoastSafety | None = None
     coasts: Array | None = None
+    target: BodyState | None = None
+    docking: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The observation of a training environment, from the states of the bodies or from estimates.
+
+The environments' own is native/observe.h; both have the same definition (docs/learning.md), which
+tests/chaserdock/test_policy.py compares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_models.docking_geometry import centre_offset
+from chaserdock_models.rigid_body import BodyState
+from chaserdock_protocol.scenario import FlightScenario, Scenario
+
+NAMES = (
+    *(f"position_{k}_m" for k in "xyz"),
+    *(f"velocity_{k}_m_s" for k in "xyz"),
+    *(f"attitude_{k}" for k in "wxyz"),
+    *(f"rate_{k}_rad_s" for k in "xyz"),
+    *(f"target_rate_{k}_rad_s" for k in "xyz"),
+)
+"""Elements of an observation without other chasers, in order."""
+
+
+def names_of(chasers: int) -> tuple[str, ...]:
+    """Return the names of the elements of an observation with this number of chasers."""
+    others = (f"other_{i}_{k}_m" for i in range(1, chasers) for k in "xyz")
+    return (*NAMES, *others)
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """Where a chaser shall be: its centre (3,), TRF, and its attitude (4,), CRF to TRF."""
+
+    position_m: Array
+    q_wxyz: Array
+
+
+def goal_of(scenario: Scenario | FlightScenario, chaser: int, task: str) -> Goal:
+    """Return the goal of a chaser in a task of ``TASKS`` (task.py)."""
+    nominal = np.asarray(scenario.chasers[chaser].position_m, dtype=float)
+    attitude = np.asarray(scenario.chasers[chaser].q_wxyz, dtype=float)
+    port = scenario.docking.port_of(chaser)
+    if task == "latch" and port is not None:
+        return Goal(centre_offset(port, scenario.chaser.probe_reach_m, 0.0), attitude)
+    if task == "hold":
+        return Goal(nominal, attitude)
+    towards = nominal / np.linalg.norm(nominal)
+    return Goal(towards * scenario.approach.dock_distance_m, attitude)
+
+
+def observation_of(
+    goal: Goal, chaser: BodyState, target: BodyState, others_m: Sequence[Array] = ()
+) -> Array:
+    """Return the observation (16 + 3 n,) of a chaser: see docs/learning.md.
+
+    ``others_m``: positions (3,), WRF, of the other chasers, by number.
+    """
+    into_target = rotations.conjugate(target.q_wxyz)
+    position = rotations.rotate(into_target, chaser.position_m - target.position_m)
+    velocity = rotations.rotate(into_target, chaser.velocity_m_s - target.velocity_m_s)
+    velocity = velocity - rotations.cross(target.omega_rad_s, position)
+    attitude = rotations.multiply(into_target, chaser.q_wxyz)
+    rate = chaser.omega_rad_s - rotations.rotate_inverse(attitude, target.omega_rad_s)
+    error = rotations.multiply(rotations.conjugate(goal.q_wxyz), attitude)
+    if error[0] < 0.0:
+        error = -error
+    others = [rotations.rotate(into_target, at - chaser.position_m) for at in others_m]
+    return np.concatenate(
+        [position - goal.position_m, velocity, error, rate, target.omega_rad_s, *others]
+    )

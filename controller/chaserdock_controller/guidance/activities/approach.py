@@ -43,7 +43,8 @@ class ApproachActivity(Activity):
 
     def step(self, chaser: ChaserMachine, known: ChaserTick, errors: TrackingErrors) -> None:
         state, now_s, approach = chaser.state, known.now_s, chaser.scenario.approach
-        if length(chaser.line.docked_m - state.move.goal_m) > _FOLLOWED_M:  # its port has moved
+        off_m = length(chaser.line.docked_m - state.move.goal_m)
+        if chaser.port is not None and off_m > _FOLLOWED_M:  # the port has moved with its map
             move = move_to(state.move, chaser.line.docked_m, now_s, approach.max_speed_m_s)
             state = chaser.state = replace(state, move=move)
         if not state.over_at(now_s):

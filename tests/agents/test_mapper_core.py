@@ -354,4 +354,4 @@ def test_a_port_waits_until_the_loop_has_closed(monkeypatch: pytest.MonkeyPatch)
     assert off @ towards > 1.0
     assert np.linalg.norm(off - (off @ towards) * towards) < 0.01
     two = PortRequest(chaser=0, image=1, pixel=pixel, find="flat")
-    assert core.choose(two)[0].reason.startswith("give either")
+    assert core.choose(two)[0].reason.startswith("give image and pixel")

@@ -230,9 +230,7 @@ class MapperCore:
         if sum(w is not None for w in wanted) != 1 or (request.pixel is None) != (
             request.image is None
         ):
-            decision = PortDecision(
-                False, "give either image and pixel, or a point, or what to find"
-            )
+            decision = PortDecision(False, "give image and pixel, or a point, or what to find")
         elif newest is None:
             decision = PortDecision(False, f"no map of the target: {self._status or 'gathering'}")
         else:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_agents.mapper.docking_site import SiteLimits, judged_site, site_on_ray
-from chaserdock_agents.mapper.ports import Decision, MappedPoints, PortChooser
+from chaserdock_agents.mapper.ports import MappedPoints, PortChooser, PortDecision
 from chaserdock_agents.mapper.surface import MappedSurface, SightLines, surface_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -300,7 +300,7 @@ def test_a_pixel_chooses_where_its_line_of_sight_meets_the_target() -> None:
     assert ports.decide(0, choice, (camera, place - camera)).accepted
     assert np.linalg.norm(ports.ports()[0].position_m - place) < 0.02
     away = ports.decide(0, choice, (camera, camera - place))
-    assert away == Decision(False, "the line of sight does not meet the target")
+    assert away == PortDecision(False, "the line of sight does not meet the target")
     assert len(ports.ports()) == 1  # the one before stays
 
 

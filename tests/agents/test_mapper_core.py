@@ -13,7 +13,7 @@ import pytest
 from chaserdock_agents.mapper.core import HELP, MapperCore, TrackCollector
 from chaserdock_agents.mapper.frame import MapFrame
 from chaserdock_agents.mapper.mapper import MapperTuning, TargetMap
-from chaserdock_agents.mapper.ports import Decision, PortChooser
+from chaserdock_agents.mapper.ports import PortChooser, PortDecision
 from chaserdock_agents.mapper.types import ConstantRates
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -310,9 +310,9 @@ class ClosedLater(MapperCore):
 def test_a_port_waits_until_the_loop_has_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     rays: list[Any] = []
 
-    def decide(self: PortChooser, chaser: int, where: Any, ray: Any) -> Decision:
+    def decide(self: PortChooser, chaser: int, where: Any, ray: Any) -> PortDecision:
         rays.append((chaser, where, ray))
-        return Decision(False, "not flat")
+        return PortDecision(False, "not flat")
 
     early = MapperCore(scenario())
     find = PortRequest(chaser=0, find="flat", operator="me")
@@ -354,4 +354,4 @@ def test_a_port_waits_until_the_loop_has_closed(monkeypatch: pytest.MonkeyPatch)
     assert off @ towards > 1.0
     assert np.linalg.norm(off - (off @ towards) * towards) < 0.01
     two = PortRequest(chaser=0, image=1, pixel=pixel, find="flat")
-    assert core.choose(two)[0].reason.startswith("give either")
+    assert core.choose(two)[0].reason.startswith("give image and pixel")

@@ -36,7 +36,7 @@ from chaserdock_protocol.topics import Topic
 
 from .frame import MapFrame
 from .mapper import MAP_STATUS, Mapper, TargetMap
-from .ports import Decision, MappedPoints, PortChooser
+from .ports import MappedPoints, PortChooser, PortDecision
 from .surface import SightLines
 from .types import CameraUncertainty, ImageTracks
 
@@ -230,9 +230,9 @@ class MapperCore:
         if sum(w is not None for w in wanted) != 1 or (request.pixel is None) != (
             request.image is None
         ):
-            decision = Decision(False, "give either image and pixel, or a point, or what to find")
+            decision = PortDecision(False, "give image and pixel, or a point, or what to find")
         elif newest is None:
-            decision = Decision(False, f"no map of the target: {self._status or 'gathering'}")
+            decision = PortDecision(False, f"no map of the target: {self._status or 'gathering'}")
         else:
             decision = self._decide(request.chaser, request, newest)
         head = newest or LandmarkMap(status="gathering", next_tick=0)
@@ -258,16 +258,16 @@ class MapperCore:
 
     def _decide(
         self, chaser: int, where: PortRequest | PortChoice, newest: LandmarkMap
-    ) -> Decision:
+    ) -> PortDecision:
         if newest.status != "mapped":
-            return Decision(False, f"no distances in the map: {newest.status}")
+            return PortDecision(False, f"no distances in the map: {newest.status}")
         if not self._closed:
-            return Decision(False, OPEN)
+            return PortDecision(False, OPEN)
         if where.pixel is None:
             return self._ports.decide(chaser, where, None)
         image = self._image_for(where, newest)
         if image is None:
-            return Decision(False, f"no image of chaser {where.image} at that time")
+            return PortDecision(False, f"no image of chaser {where.image} at that time")
         camera = self._camera
         x, y = camera.normalized(camera.undistort(np.array(where.pixel))).tolist()
         towards_w = rotations.rotate(image.q_wxyz, [x, y, 1.0])
@@ -418,7 +418,7 @@ def _event(message: LandmarkMap) -> Event:
     return event_of(message, f"map of the target: {message.status}", detail, calm)
 
 
-def _port_event(message: LandmarkMap, chaser: int, decision: Decision) -> Event:
+def _port_event(message: LandmarkMap, chaser: int, decision: PortDecision) -> Event:
     what = f"port of chaser {chaser}: {'chosen' if decision.accepted else 'refused'}"
     return event_of(message, what, decision.answer, decision.accepted)
 

@@ -69,7 +69,7 @@ class MappedPoints:
 
 
 @dataclass(frozen=True)
-class Decision:
+class PortDecision:
     """Whether a place became a port, and the answer to who asked: its figures, or why not."""
 
     accepted: bool
@@ -107,18 +107,18 @@ class PortChooser:
         with self._lock:
             return tuple(held.port for _, held in sorted(self._held.items()))
 
-    def decide(self, chaser: int, where: Where, ray: tuple[Array, Array] | None) -> Decision:
+    def decide(self, chaser: int, where: Where, ray: tuple[Array, Array] | None) -> PortDecision:
         """Judge a place by the last map; make it the chaser's port if nothing is against it.
 
         ``ray``: origin and direction (3,) of a line of sight, for a request by a pixel.
         """
         with self._lock:
             if reason := self._why_impossible(chaser):
-                return Decision(False, reason)
+                return PortDecision(False, reason)
             points = self._points
             surface = None if points is None else points.surface
             if points is None or surface is None:
-                return Decision(False, "there is no surface: the map has too few landmarks")
+                return PortDecision(False, "there is no surface: the map has too few landmarks")
             if where.find is not None:
                 return self._found(chaser, points, surface)
             if ray is not None:
@@ -127,7 +127,7 @@ class PortChooser:
                 assert where.point_m is not None
                 site = self._nearest(np.array(where.point_m), points, surface)
             if site is None:
-                return Decision(False, "the line of sight does not meet the target")
+                return PortDecision(False, "the line of sight does not meet the target")
             return self._decided(chaser, site, points)
 
     def _why_impossible(self, chaser: int) -> str:
@@ -161,12 +161,12 @@ class PortChooser:
         known = surface, points.landmarks_m, points.covariances_m2, self._limits
         return [judged_site(middles[k], normals[k], *known, bool(surface.seen[k])) for k in faces]
 
-    def _found(self, chaser: int, points: MappedPoints, surface: MappedSurface) -> Decision:
+    def _found(self, chaser: int, points: MappedPoints, surface: MappedSurface) -> PortDecision:
         """Return the decision for the best place of a search over the surface."""
         judged = self._judged(_candidates(surface), points, surface)
         good = [s for s in judged if not self._why_not(chaser, s)]
         if not good:
-            return Decision(False, f"none of {len(judged)} places will do")
+            return PortDecision(False, f"none of {len(judged)} places will do")
         best = sorted(good, key=lambda s: -score(s, self._limits))[:_PROPOSALS]
         decision = self._decided(chaser, best[0], points)
         others = "; ".join(
@@ -175,7 +175,7 @@ class PortChooser:
         of = f"; {len(good)} of {len(judged)} places will do"
         return replace(decision, answer=decision.answer + of + (f", next: {others}" * bool(others)))
 
-    def _decided(self, chaser: int, site: DockingSite, points: MappedPoints) -> Decision:
+    def _decided(self, chaser: int, site: DockingSite, points: MappedPoints) -> PortDecision:
         figures = (
             f"({_text(site.position_m)}) m, normal ({_text(site.normal)}) within "
             f"{math.degrees(min(site.normal_sigma_rad, math.pi)):.2g} degrees, "
@@ -186,7 +186,7 @@ class PortChooser:
         room_m = min(site.clearance_m, _MOST_CLEARANCE_M)
         figures += f", {room_m:.2f} m of room beside the corridor"
         if why := self._why_not(chaser, site):
-            return Decision(False, f"{'; '.join(why)}: {figures}")
+            return PortDecision(False, f"{'; '.join(why)}: {figures}")
         self._chosen += 1
         port = ChosenPort(
             chaser=chaser,
@@ -198,7 +198,7 @@ class PortChooser:
             clearance_m=room_m,
         )
         self._held[chaser] = _anchored(port, points)
-        return Decision(True, f"{figures}, score {score(site, self._limits):.2f}")
+        return PortDecision(True, f"{figures}, score {score(site, self._limits):.2f}")
 
     def _why_not(self, chaser: int, site: DockingSite) -> tuple[str, ...]:
         """Return the reasons against a place for a chaser, those of reach included."""

@@ -36,7 +36,7 @@ def facts_of(task: TrainingTask) -> dict[str, str]:
         "observation": json.dumps(names_of(len(scenario.chasers))),
         "actuation": scenario.chaser.actuation,
         "actuators": str(task.actuators),
-        "rate_hz": f"{scenario.time.rate_hz:g}",
+        "rate_hz": str(float(scenario.time.rate_hz)),
     }
 
 

@@ -42,6 +42,8 @@ def start_of(scenario, seed):
         "target.omega_rad_s": scenario.target.omega_rad_s
         + np.radians(spread.target_rate_deg_s) * rng.uniform(-1, 1, 3),
     }
+    # The spread is about the start as drawn: none is left.
+    drawn["learning.start.position_m"] = np.zeros(3)
     return (*(f"{k}={toml_value(v.tolist())}" for k, v in drawn.items()), f"seed={seed}")
 
 

@@ -50,3 +50,11 @@ def network(weights, middle, scale, facts) -> ModelProto:
     helper.set_model_props(model, facts)
     checker.check_model(model)
     return model
+
+
+def weights_of(model):
+    """Return weights, middle and scale of a model of ``network``."""
+    found = {c.name: numpy_helper.to_array(c) for c in model.graph.initializer}
+    names = ("layer_1", "layer_2", "layer_3", "past")
+    weights = [(found[f"{name}_1"], found[f"{name}_2"]) for name in names]
+    return weights, found["centred_1"], found["normalized_1"]

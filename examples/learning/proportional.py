@@ -21,8 +21,8 @@ from chaserdock.envs.task import OUTCOMES
 
 SCENARIO = Path(__file__).with_name("docking.toml")
 APPROACH_PER_S = 0.2  # speed towards the goal for each metre from it
-FASTEST_M_S = 0.05  # far below what the thrust can stop within the last decimetre
-CONTACT_M_S = 0.012  # the latch closes up to 0.02 m/s
+FASTEST_M_S = 0.038  # in the corridor up to 0.04 m/s are allowed
+CONTACT_M_S = 0.014  # in its last part up to 0.016 m/s
 ASIDE = 3.0  # first onto the port's axis, and then along it
 VELOCITY_PER_S = 6.0  # acceleration for each m/s of velocity error
 ATTITUDE_PER_S2, RATE_PER_S = 0.6, 1.55  # angular acceleration for attitude (rad) and rate (rad/s)

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 import onnx
 import proportional
-from policy_file import NEAR, network
+from policy_file import NEAR, network, weights_of
 
 from chaserdock.envs import loaded
 from chaserdock.envs.batch import DockingBatch
@@ -35,17 +35,18 @@ FOLDER = Path(__file__).parent
 ENVIRONMENTS, TICKS = 2048, 64  # of a batch: 9 s of each environment
 HIDDEN = 64
 DISCOUNT = 0.998  # per tick: 33 s, about one docking
-TRACE = 0.95  # lambda of the advantages
+TRACE = 0.98  # lambda of the advantages
 CLIP = 0.2
 AIM = 0.01  # divergence of a batch from the policy that flew it: the rate is adapted to it
 EPOCHS, PARTS = 3, 16  # passes over a batch, in this many parts
 SPREAD_TICKS = 375  # 25 s, about one episode
-RATES = (1e-4, 1e-3)  # of policy and critic at first; both fall, and the policy's follows AIM
+RATES = (5e-5, 1e-3)  # of policy and critic at first; both fall, and the policy's follows AIM
 IMITATION_RATE = 2e-3
-NOISE = 0.1  # standard deviation of actions at first, before they are limited
+NOISE = 0.06  # standard deviation of actions at first, before they are limited
 REWARD_SCALE = 0.1  # returns of some tens become some units
-KEPT = 20  # batches after which policy and curve are written
-IMITATION_ROUNDS, VALUE_ROUNDS = 6, 4
+KEPT = 10  # batches after which policy and curve are written
+IMITATION_ROUNDS, VALUE_ROUNDS = 12, 60
+EPISODE_TICKS = 448  # 30 s: most episodes end within them
 
 
 def features(z):
@@ -145,14 +146,14 @@ def divergence(policy, spread, batch):
 
 
 @jax.jit
-def advantages(critic, z, rewards, terminated, done, started):
+def advantages(critic, trace, z, rewards, terminated, done, started):
     """Return advantages and returns (T, n) of observations (T + 1, n, width)."""
     values = output(critic, z)[..., 0]
     gains = rewards + DISCOUNT * values[1:] * (1.0 - terminated) - values[:-1]
 
     def back(after, tick):
         gain, ended, start = tick
-        now = (1.0 - start) * (gain + DISCOUNT * TRACE * (1.0 - ended) * after)
+        now = (1.0 - start) * (gain + DISCOUNT * trace * (1.0 - ended) * after)
         return now, now
 
     _, found = jax.lax.scan(back, jnp.zeros(z.shape[1]), (gains, done, started), reverse=True)
@@ -232,7 +233,7 @@ def imitated(flights, policy, rng):
             flights.scale = np.maximum(flights.scale, 1e-6 + 0.02 * flights.scale.max())
         z, aim = np.concatenate(seen[-512:]), np.concatenate(wanted[-512:])
         z = (z - flights.middle) / flights.scale
-        for _ in range(200):
+        for _ in range(300):
             rows = rng.integers(len(z), size=4096)
             number += 1
             rate = IMITATION_RATE * (1.0 - round_ / IMITATION_ROUNDS)
@@ -244,11 +245,11 @@ def imitated(flights, policy, rng):
     return policy
 
 
-def collect(flights, trained, key):
-    """Return a batch: (normalized observations, u, densities, ...) each (T, n, ...)."""
-    (policy, spread), _ = trained
+def collect(flights, trained, ticks, trace, key):
+    """Fly, and return the columns of ``loss`` by row: of all ticks of all environments."""
+    (policy, spread), critic = trained
     rows = []
-    for _ in range(TICKS):
+    for _ in range(ticks):
         z = flights.normalized()
         key, draw = jax.random.split(key)
         u, density = act(policy, spread, z, draw)
@@ -259,7 +260,14 @@ def collect(flights, trained, key):
         np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)
     )
     z = np.concatenate([z, flights.normalized()[None]])
-    return z, u, density, *(x.astype(np.float32) for x in facts)
+    reward, terminated, done, started = (x.astype(np.float32) for x in facts)
+    found = advantages(critic, trace, z, reward, terminated, done, started)
+    advantage, returns = (np.asarray(x) for x in found)
+    counts = 1.0 - started
+    chosen = advantage[counts > 0.0]
+    advantage = (advantage - chosen.mean()) / (chosen.std() + 1e-6)
+    columns = (z[:-1], u, density, advantage, returns, counts)
+    return tuple(jnp.asarray(x.reshape(-1, *x.shape[2:])) for x in columns)
 
 
 def main():
@@ -267,6 +275,7 @@ def main():
     parser.add_argument("--scenario", type=Path, default=FOLDER / "docking.toml")
     parser.add_argument("--out", type=Path, default=FOLDER / "docking.onnx")
     parser.add_argument("--curve", type=Path, help="write the training curve, as JSON")
+    parser.add_argument("--start", type=Path, help="begin with this policy instead of imitation")
     parser.add_argument("--batches", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
@@ -274,31 +283,34 @@ def main():
     begin_s, rng = time.process_time(), np.random.default_rng(options.seed)
     flights = Flights(loaded(options.scenario), options.seed)
     width, outputs = flights.seen.shape[-1], flights.batch.task.actuators
-    policy = imitated(flights, initial(rng, width, outputs), rng)
+    if options.start is None:
+        policy = imitated(flights, initial(rng, width, outputs), rng)
+    else:
+        policy, flights.middle, flights.scale = weights_of(onnx.load(options.start))
     spread = jnp.full(outputs, np.log(NOISE))
     trained = ((policy, spread), initial(rng, width, 1))
     moments = tuple((jax.tree.map(jnp.zeros_like, w),) * 2 for w in trained)
     number, rate = 1.0, RATES[0]
     key, curve = jax.random.key(options.seed), []
     flights.spread_out(lambda: np.array(jnp.tanh(output(policy, flights.normalized()))))
+    part = TICKS * ENVIRONMENTS
+    key, draw = jax.random.split(key)
+    batch = collect(flights, trained, EPISODE_TICKS, 1.0, draw)
+    for k in range(VALUE_ROUNDS):  # a critic that knows nothing would lead the policy astray
+        order = jnp.asarray(rng.integers(len(batch[0]), size=part))
+        rates = (0.0, RATES[1] * (1.0 - k / VALUE_ROUNDS))
+        trained, moments, number = improve(trained, moments, number, rates, order, batch)
     flights.statistics()
     for k in range(options.batches):
         key, draw = jax.random.split(key)
-        z, u, density, reward, terminated, done, started = collect(flights, trained, draw)
-        advantage, returns = advantages(trained[1], z, reward, terminated, done, started)
-        advantage, counts = np.asarray(advantage), 1.0 - started
-        chosen = advantage[counts > 0.0]
-        advantage = (advantage - chosen.mean()) / (chosen.std() + 1e-6)
-        columns = (z[:-1], u, density, advantage, np.asarray(returns), counts)
-        batch = tuple(jnp.asarray(x.reshape(-1, *x.shape[2:])) for x in columns)
+        batch = collect(flights, trained, TICKS, TRACE, draw)
         left = 1.0 - k / options.batches
         for _ in range(EPOCHS):
-            order = jnp.asarray(rng.permutation(len(batch[0])))
-            rates = (rate * left * (k >= VALUE_ROUNDS), RATES[1] * left)
+            order = jnp.asarray(rng.permutation(part))
+            rates = (rate * left, RATES[1] * left)
             trained, moments, number = improve(trained, moments, number, rates, order, batch)
         far = float(divergence(*trained[0], batch))
-        if k >= VALUE_ROUNDS:
-            rate *= 1.5 if far < 0.5 * AIM else 1.0 / 1.5 if far > 2.0 * AIM else 1.0
+        rate *= 1.5 if far < 0.5 * AIM else 1.0 / 1.5 if far > 2.0 * AIM else 1.0
         steps = (k + 1) * ENVIRONMENTS * TICKS
         curve.append({"steps": steps, "cpu_s": round(time.process_time() - begin_s, 1)})
         curve[-1] |= flights.statistics()

@@ -69,7 +69,6 @@ def flown(path, solver, sets, seed):
         "impulse_N_s": chaser.impulse_N_s,
         "attempts": 1 + sum("retreat (" in e.what for e in recorded.events),
         "changed": 0 if chaser.assurance is None else chaser.assurance.changed,
-        "events": [f"{e.sim_time_ns / 1e9:.1f} {e.what}" for e in recorded.events],
     }
 
 

@@ -276,10 +276,12 @@ def main():
     parser.add_argument("--out", type=Path, default=FOLDER / "docking.onnx")
     parser.add_argument("--curve", type=Path, help="write the training curve, as JSON")
     parser.add_argument("--start", type=Path, help="begin with this policy instead of imitation")
-    parser.add_argument("--batches", type=int, default=200)
+    parser.add_argument("--batches", type=int, default=240)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
 
+    if loaded(options.scenario).chaser.actuation != "ideal":
+        parser.error(f'{options.scenario}: wrenches are trained: chaser.actuation = "ideal"')
     begin_s, rng = time.process_time(), np.random.default_rng(options.seed)
     flights = Flights(loaded(options.scenario), options.seed)
     width, outputs = flights.seen.shape[-1], flights.batch.task.actuators

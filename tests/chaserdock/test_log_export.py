@@ -32,6 +32,19 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 # -- tables and tracks -----------------------------------------------------------------------------
 
 
+def check_part(row: dict[str, Any], name: str, values: dict[str, Any]) -> None:
+    """Check the columns of a structure in a message, and of those in it."""
+    for part, value in values.items():
+        if isinstance(value, dict):
+            check_part(row, f"{name}_{part}", value)
+        elif part == "q_wxyz":
+            assert [row[f"{name}_q_{axis}"] for axis in "wxyz"] == list(value)
+        elif f"{name}_{part}" in row:
+            assert row[f"{name}_{part}"] == (list(value) if isinstance(value, tuple) else value)
+        else:
+            assert [row[f"{name}_{part}_{axis}"] for axis in "xyz"] == list(value)
+
+
 @pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda t: t.key)
 def test_every_message_fits_its_table(topic: topics.Topic) -> None:
     sample: Any = BY_TYPE[topic.kind]
@@ -57,15 +70,7 @@ def test_every_message_fits_its_table(topic: topics.Topic) -> None:
             assert plain
             assert all(inner[0][k] == v for k, v in plain.items())
         elif isinstance(value, msgspec.Struct):
-            for part, whole_part in msgspec.to_builtins(value).items():
-                if part == "q_wxyz":
-                    assert [row[f"{name}_q_{axis}"] for axis in "wxyz"] == list(whole_part)
-                elif f"{name}_{part}" in row:
-                    assert row[f"{name}_{part}"] == (
-                        list(whole_part) if isinstance(whole_part, tuple) else whole_part
-                    )
-                else:
-                    assert [row[f"{name}_{part}_{axis}"] for axis in "xyz"] == list(whole_part)
+            check_part(row, name, msgspec.to_builtins(value))
         elif value == () and name not in row:
             assert (
                 len(whole[f"{table_name(topic)}_{name}"]) == 0

@@ -15,7 +15,7 @@ import numpy as np
 from .arrays import Array
 
 
-class MassProperties(NamedTuple):
+class MassDistribution(NamedTuple):
     """Mass, centre of mass (3,) and inertia (3, 3) about it, in one frame."""
 
     mass_kg: float
@@ -30,7 +30,7 @@ def _parallel_axis(mass_kg: float, place_m: Array) -> Array:
     return mass_kg * ((x * x + y * y + z * z) * np.eye(3) - np.outer(r, r))
 
 
-def rigid_rest(whole: MassProperties, masses_kg: Array, places_m: Array) -> MassProperties:
+def rigid_rest(whole: MassDistribution, masses_kg: Array, places_m: Array) -> MassDistribution:
     """Return what is left of a body without point masses (n,) at ``places_m`` (n, 3).
 
     Frame as of ``whole``. The result need not be a body that can exist: see ``rest_fault``.
@@ -40,10 +40,10 @@ def rigid_rest(whole: MassProperties, masses_kg: Array, places_m: Array) -> Mass
     inertia = whole.inertia_kg_m2 + _parallel_axis(whole.mass_kg, whole.centre_m)
     for m, place in zip(masses_kg.tolist(), places_m, strict=True):
         inertia = inertia - _parallel_axis(m, place)
-    return MassProperties(mass, centre, inertia - _parallel_axis(mass, centre))
+    return MassDistribution(mass, centre, inertia - _parallel_axis(mass, centre))
 
 
-def rest_fault(rest: MassProperties) -> str:
+def rest_fault(rest: MassDistribution) -> str:
     """Return why no rigid body has these mass properties; empty if one has."""
     moments = np.linalg.eigvalsh(rest.inertia_kg_m2)
     if moments[0] > 0.0 and 2.0 * moments[2] <= moments.sum() * (1.0 + 1e-9):
@@ -53,7 +53,7 @@ def rest_fault(rest: MassProperties) -> str:
 
 
 def frequencies_hz(
-    rest: MassProperties, masses_kg: Array, places_m: Array, held_hz: Array
+    rest: MassDistribution, masses_kg: Array, places_m: Array, held_hz: Array
 ) -> Array:
     """Return the frequencies (3 n,), ascending, of a free body with masses on springs.
 

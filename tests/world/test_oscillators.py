@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.oscillators import MassProperties, frequencies_hz, rigid_rest
+from chaserdock_models.oscillators import MassDistribution, frequencies_hz, rigid_rest
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.thruster_model import G0_M_S2
 from chaserdock_protocol.messages import ActuatorCommand, ThrusterPulse
@@ -144,7 +144,7 @@ def test_motion_agrees_with_basilisk(engine: str, monkeypatch: pytest.MonkeyPatc
 
 
 def test_rigid_rest_and_masses_make_up_the_whole_body() -> None:
-    whole = MassProperties(17.0, np.array([0.01, -0.02, 0.03]), np.diag([0.4, 0.5, 0.6]))
+    whole = MassDistribution(17.0, np.array([0.01, -0.02, 0.03]), np.diag([0.4, 0.5, 0.6]))
     whole.inertia_kg_m2[0, 1] = whole.inertia_kg_m2[1, 0] = 0.03
     masses, places = np.array([0.5, 2.0]), np.array([[0.1, 0.4, -0.2], [-0.1, 0.05, 0.1]])
     rest = rigid_rest(whole, masses, places)
@@ -161,7 +161,7 @@ def test_rigid_rest_and_masses_make_up_the_whole_body() -> None:
 
 
 def test_a_free_body_oscillates_faster_than_a_held_one() -> None:
-    rest = MassProperties(8.0, np.array([0.1, -0.2, 0.3]), np.diag([0.5, 0.6, 0.7]))
+    rest = MassDistribution(8.0, np.array([0.1, -0.2, 0.3]), np.diag([0.5, 0.6, 0.7]))
     held = np.array([[0.5, 0.6, 0.7]])
     at_centre = frequencies_hz(rest, np.array([2.0]), np.array([rest.centre_m]), held)
     np.testing.assert_allclose(at_centre, held[0] * math.sqrt(1.0 + 2.0 / 8.0))

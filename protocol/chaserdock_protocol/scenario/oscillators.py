@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from chaserdock_models.arrays import Array
-from chaserdock_models.oscillators import MassProperties, frequencies_hz, rest_fault, rigid_rest
+from chaserdock_models.oscillators import MassDistribution, frequencies_hz, rest_fault, rigid_rest
 from pydantic import Field
 
 from .fields import Fraction, Positive, PositiveVector, Section, Vector
@@ -77,10 +77,10 @@ def check_oscillators(scenario: Scenario) -> None:
                 '(chaser.actuation = "thrusters")'
             )
     for body, whole in (
-        ("chaser", MassProperties(chaser.mass_kg, np.zeros(3), np.diag(chaser.inertia))),
+        ("chaser", MassDistribution(chaser.mass_kg, np.zeros(3), np.diag(chaser.inertia))),
         (
             "target",
-            MassProperties(
+            MassDistribution(
                 target.mass_kg, np.array(target.centre_of_mass_m), target.inertia_tensor
             ),
         ),
@@ -90,7 +90,7 @@ def check_oscillators(scenario: Scenario) -> None:
             raise ValueError(f"truth.oscillator: the {body}: {fault}")
 
 
-def _fault(oscillators: Sequence[Oscillator], whole: MassProperties, physics_hz: int) -> str:
+def _fault(oscillators: Sequence[Oscillator], whole: MassDistribution, physics_hz: int) -> str:
     """Return why a body cannot carry these, or why physics steps do not resolve their motion."""
     if (share := sum(o.mass_share for o in oscillators)) >= 1.0:
         return f"mass_share adds up to {share:g}, which must be less than 1"

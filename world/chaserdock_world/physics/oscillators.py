@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.oscillators import MassProperties, rest_fault, rigid_rest
+from chaserdock_models.oscillators import MassDistribution, rest_fault, rigid_rest
 from chaserdock_protocol.scenario import Scenario, ScenarioError
 from chaserdock_protocol.scenario.oscillators import Oscillator, point_masses
 
@@ -130,7 +130,7 @@ def carried_by(
         stated = scenario.truth.oscillators("target" if name == TARGET else "chaser")
         if stated:
             masses_kg, places_m = point_masses(stated, plant.mass_kg)
-            whole = MassProperties(plant.mass_kg, plant.centre_of_mass_m, plant.inertia_kg_m2)
+            whole = MassDistribution(plant.mass_kg, plant.centre_of_mass_m, plant.inertia_kg_m2)
             rest = rigid_rest(whole, masses_kg, places_m)
             if fault := rest_fault(rest):
                 raise ScenarioError(f"{scenario.name}: truth.oscillator: {name} as drawn: {fault}")

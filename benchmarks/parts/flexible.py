@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +20,7 @@ from chaserdock_world.physics.simulation import Physics
 from chaserdock_world.plant import chaser_plant
 from common import ROOT, BenchmarkFailed, Figures, Group, Options
 from flights.engine_comparison import ENGINES
+from peers.basilisk import run_basilisk
 
 REFERENCE = ROOT / "tests" / "world" / "basilisk_flexible.json"
 BAR_SHARE = 1e-4
@@ -201,16 +201,7 @@ def fly_in_basilisk(python: str) -> dict[str, list[dict[str, Any]]]:
         "seconds": SECONDS,
         "pulses": PULSES,
     }
-    done = subprocess.run(
-        [python, "-c", _BASILISK],
-        input=json.dumps(given),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise SystemExit(f"Basilisk failed: {done.stderr.strip()[-2000:]}")
-    flown = json.loads(done.stdout.split("RESULT")[1])
+    flown = run_basilisk(python, _BASILISK, given)
     return {
         name: [_led(row) | {"at_s": at} for at, row in zip(SECONDS, rows, strict=True)]
         for name, rows in zip(CASES, flown, strict=True)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 import tempfile
 from argparse import ArgumentParser
 from dataclasses import asdict
@@ -27,6 +26,7 @@ from chaserdock_models.orbit import (
 )
 from chaserdock_models.relative_motion import cw_transition, propagate_relative
 from common import ROOT, Figures, Group, Options
+from peers.basilisk import run_basilisk
 
 REFERENCE = ROOT / "tests" / "models" / "basilisk_relative_orbit.json"
 
@@ -123,16 +123,7 @@ def fly_in_basilisk(python: str, folder: Path) -> list[dict[str, Any]]:
                 "steps": case["duration_s"],
             }
         )
-    done = subprocess.run(
-        [python, "-c", _BASILISK],
-        input=json.dumps(given),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise SystemExit(f"Basilisk failed: {done.stderr.strip()[-2000:]}")
-    results = json.loads(done.stdout.split("RESULT")[1])
+    results = run_basilisk(python, _BASILISK, given)
     for case, result in zip(flown, results, strict=True):
         orbit, body = (OrbitState(*map(np.array, s)) for s in result["states"])
         case["duration_s"] = result["duration_s"]

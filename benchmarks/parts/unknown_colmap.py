@@ -21,7 +21,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.satellites import satellite
 from common import BenchmarkFailed, Figures, Group, KeptResults, Options, seeds_of
 
-from .unknown_map import case_of, surface_distances
+from .unknown_map import case_of, nearest_rotation, surface_distances
 from .unknown_scene import SceneCase, UnknownImages
 
 EVERY = 10
@@ -67,7 +67,8 @@ def fly(case: SceneCase, folder: Path, seed: int) -> ColmapOutcome:
     from peers.colmap_map import map_images
 
     images = UnknownImages(replace(case, seed=seed), folder)
-    radius_m = max(float(np.linalg.norm(p.vertices_m, axis=1).max()) for p in _parts(case))
+    parts = satellite(case.mesh).parts
+    radius_m = max(float(np.linalg.norm(p.vertices_m, axis=1).max()) for p in parts)
     with TemporaryDirectory() as work:
         masks = Path(work) / "masks"
         masks.mkdir()
@@ -109,20 +110,14 @@ def fly(case: SceneCase, folder: Path, seed: int) -> ColmapOutcome:
     )
 
 
-def _parts(case: SceneCase):
-    return satellite(case.mesh).parts
-
-
 def _similarity(points: Array, to: Array) -> tuple[float, Array, Array]:
     """Return scale, rotation (3, 3) and shift (3,) of the similarity nearest to a map of points (n,
     3): S. Umeyama, "Least-squares estimation of transformation parameters", 1991.
     """
     middle, to_middle = points.mean(axis=0), to.mean(axis=0)
     a, b = points - middle, to - to_middle
-    u, s, v = np.linalg.svd(b.T @ a)
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    turn = u @ sign @ v
-    scale = float((s * np.diag(sign)).sum() / (a**2).sum())
+    turn = nearest_rotation(b.T @ a)
+    scale = float((b * (a @ turn.T)).sum() / (a**2).sum())
     return scale, turn, to_middle - scale * turn @ middle
 
 

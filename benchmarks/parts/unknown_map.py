@@ -264,8 +264,8 @@ def pose_errors(
     true_r = rotations.to_matrix(np.array([t[1] for t in true]))
     tilt, turn = np.eye(3), np.eye(3)
     for _ in range(_ALIGNMENTS):  # r = tilt true_r turn'
-        turn = _nearest((r.transpose(0, 2, 1) @ tilt @ true_r).mean(axis=0))
-        tilt = _nearest((r @ turn @ true_r.transpose(0, 2, 1)).mean(axis=0))
+        turn = nearest_rotation((r.transpose(0, 2, 1) @ tilt @ true_r).mean(axis=0))
+        tilt = nearest_rotation((r @ turn @ true_r.transpose(0, 2, 1)).mean(axis=0))
     # p + r origin = true_p + offset, for constant origin and offset.
     rows = np.concatenate([r, -np.repeat(np.eye(3)[None], len(r), axis=0)], axis=2)
     # Along the axis of rotation the two are one: it counts as the place of the origin.
@@ -289,7 +289,7 @@ _ALIGNMENTS = 20
 """Repetitions until two rotations agree."""
 
 
-def _nearest(m: Array) -> Array:
+def nearest_rotation(m: Array) -> Array:
     """Return the rotation nearest to a matrix (3, 3)."""
     u, _, v = np.linalg.svd(m)
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v

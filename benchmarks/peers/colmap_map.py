@@ -16,8 +16,7 @@ import pycolmap  # type: ignore[import-not-found]
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 
-_HALF_PX = 0.5
-"""COLMAP's pixels begin at the corner of the image, ours in the middle of the first one."""
+from chaserdock.datasets.sequences import colmap_camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +41,8 @@ def map_images(
     """
     database = work / "database.db"
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model, reader.mask_path = "PINHOLE", masks
-    numbers = (camera.fx_px, camera.fy_px, camera.cx_px + _HALF_PX, camera.cy_px + _HALF_PX)
-    reader.camera_params = ",".join(map(repr, numbers))
+    reader.camera_model, _, _, *numbers = colmap_camera(camera).split()
+    reader.mask_path, reader.camera_params = masks, ",".join(numbers)
     pycolmap.extract_features(
         database,
         images,

@@ -163,11 +163,7 @@ def dataset(
     flight as a sequence with true poses, for SLAM and structure from motion.
     """
     if out is None:
-        drawing = (
-            "layout", "seed", "range_m", "offset", "phase", "validation", "overrides", "renderer",
-            "samples", "jobs",
-        )  # fmt: skip
-        refuse_options(context, drawing, "only with --out")
+        refuse_options(context, ("layout", *_DRAWING), "only with --out")
         from chaserdock.datasets.types import Selection
 
         wanted = Selection(domain, object, None if split is None else split.value)
@@ -176,11 +172,7 @@ def dataset(
     scoring = ("name", "scenario", "split", "domain", "object", "as_json")
     refuse_options(context, scoring, "not with --out")
     if _is_log(Path(source)):
-        drawing = (
-            "images", "seed", "range_m", "offset", "phase", "validation", "overrides", "renderer",
-            "samples", "jobs",
-        )  # fmt: skip
-        refuse_options(context, drawing, "not for a flight")
+        refuse_options(context, ("images", *_DRAWING), "not for a flight")
         _write_sequence(Path(source), out, layout)
         return
     if layout in (LayoutOption.euroc, LayoutOption.colmap):
@@ -209,6 +201,12 @@ def dataset(
         samples if renderer is RendererOption.path else None, jobs,
     )  # fmt: skip
     print(f"{out}: {images} images of {loaded.target.model}, {' and '.join(layouts)}, seed {seed}")
+
+
+_DRAWING = (
+    "seed", "range_m", "offset", "phase", "validation", "overrides", "renderer", "samples", "jobs",
+)  # fmt: skip
+"""Options of drawn images."""
 
 
 def _is_log(source: Path) -> bool:

@@ -17,7 +17,7 @@ from chaserdock_protocol.scenario import Scenario, flight_scenario_json
 
 from .bop import BopWriter
 from .speed_plus import SpeedPlusWriter
-from .types import DatasetError, Layout, Split, check_camera
+from .types import DatasetError, Layout, Split, check_camera, check_new
 from .views import ViewLimits, ViewRenderer
 
 DESCRIPTION = "dataset.json"
@@ -44,8 +44,7 @@ def export_dataset(
     Raises DatasetError for a folder that is not empty or cannot be written, and for a camera with
     errors; ChaserdockError without the extra.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DatasetError(f"{folder}: exists already; give a new folder")
+    check_new(folder)
     for layout in layouts:
         check_camera(scenario.camera_model(), layout)
     tracer = None

@@ -40,7 +40,7 @@ from chaserdock.logs.reader import Log, open_log
 from .export import DESCRIPTION
 from .model_files import write_models
 from .shapes import shape_of
-from .types import DatasetError, SequenceLayout, check_camera
+from .types import DatasetError, SequenceLayout, check_camera, check_new
 from .views import target_mesh
 
 _HALF_PX = 0.5
@@ -74,8 +74,7 @@ def export_sequence(
     Raises DatasetError for a folder that is not empty or cannot be written, a lens that a layout
     cannot state, and a log without images or motion; LogError for a damaged log.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DatasetError(f"{folder}: exists already; give a new folder")
+    check_new(folder)
     opened = open_log(log)
     scenario, camera = opened.scenario, opened.scenario.camera_model()
     for layout in layouts:
@@ -94,9 +93,11 @@ def export_sequence(
         writers = [kinds[k](folder / k, scenario, paths, cameras) for k in layouts]
         for image in opened.messages(Image):
             row = _row_at(paths[image.chaser], image.sim_time_ns)
-            if row is not None:
-                for writer in writers:
-                    writer.add(image, row)
+            if row is None:
+                continue
+            pixels = _pixels(image)
+            for writer in writers:
+                writer.add(image, pixels, row)
         for writer in writers:
             writer.close()
         mesh = target_mesh(scenario)
@@ -170,13 +171,12 @@ class EurocWriter:
     cameras: dict[int, Camera]
     _names: dict[int, list[str]] = field(default_factory=lambda: defaultdict(list))
 
-    def add(self, image: Image, row: int) -> None:
-        """Write an image."""
-        del row
+    def add(self, image: Image, pixels: NDArray[np.uint8], row: int) -> None:
+        """Write an image; its pose is in a row of the chaser's path."""
         name = f"{image.sim_time_ns}.png"
         data = self._of(image.chaser) / "cam0" / "data"
         data.mkdir(parents=True, exist_ok=True)
-        write_image(data / name, _pixels(image))
+        write_image(data / name, pixels)
         self._names[image.chaser].append(f"{image.sim_time_ns},{name}")
 
     def close(self) -> None:
@@ -254,7 +254,7 @@ class ColmapWriter:
     cameras: dict[int, Camera]
     _rows: list[str] = field(default_factory=list)
 
-    def add(self, image: Image, row: int) -> None:
+    def add(self, image: Image, pixels: NDArray[np.uint8], row: int) -> None:
         """Write an image, and keep its pose: TRF to camera."""
         path, true = self.paths[image.chaser], self.cameras[image.chaser]
         suffix = "jpg" if image.encoding == "jpeg" else "png"
@@ -262,10 +262,9 @@ class ColmapWriter:
         file = self.folder / "images" / name
         file.parent.mkdir(parents=True, exist_ok=True)
         if image.encoding == "jpeg":
-            _pixels(image)  # refuse what is no image
             write_atomically(file, image.data)
         else:
-            write_image(file, _pixels(image))
+            write_image(file, pixels)
         q_camera = rotations.multiply(path.q_wxyz[row], true.q_crf_irf_wxyz)
         eye = path.position_m[row] + rotations.rotate(path.q_wxyz[row], true.position_crf_m)
         into = rotations.conjugate(q_camera)
@@ -278,7 +277,7 @@ class ColmapWriter:
         sparse = self.folder / "sparse" / "0"
         sparse.mkdir(parents=True)
         cameras = [
-            f"{i + 1} {_colmap_camera(self.scenario.camera_model())}"
+            f"{i + 1} {colmap_camera(self.scenario.camera_model())}"
             for i, path in self.paths.items()
             if len(path.time_ns)
         ]
@@ -289,7 +288,7 @@ class ColmapWriter:
         write_atomically(sparse / "points3D.txt", "# no points\n")
 
 
-def _colmap_camera(camera: Camera) -> str:
+def colmap_camera(camera: Camera) -> str:
     """Return model, size and parameters of a camera, as calibrated."""
     given = list(camera.distortion)
     if camera.lens_model == "equidistant":

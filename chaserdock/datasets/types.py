@@ -39,6 +39,12 @@ class DatasetError(ChaserdockError):
     """
 
 
+def check_new(folder: Path) -> None:
+    """Raise DatasetError for a folder that has content, or is a file."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DatasetError(f"{folder}: exists already; give a new folder")
+
+
 def check_camera(camera: Camera, layout: Layout | SequenceLayout) -> None:
     """Raise DatasetError for a lens that a layout cannot state."""
     if camera.lens_model == "equidistant" and layout in _FISHEYES:

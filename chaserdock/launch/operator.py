@@ -71,10 +71,7 @@ def send_port_request(link: Link, request: PortRequest, timeout_s: float) -> Com
     for a request that does not say where in one way, or without a reply; RightsError,
     TransportError.
     """
-    wanted = [request.pixel, request.point_m, request.find]
-    if sum(w is not None for w in wanted) != 1 or (request.image is None) != (
-        request.pixel is None
-    ):
+    if not request.says_one_place:
         raise OperatorError(
             "port: needs either --image and --pixel X Y, or --point X Y Z, or --find"
         )

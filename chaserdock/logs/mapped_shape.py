@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from chaserdock_agents.mapper.core import pose_at
 from chaserdock_agents.mapper.surface import MappedSurface, SightLines, surface_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -86,17 +87,9 @@ def _sights(message: LandmarkMap, images: list[FeatureTracks]) -> SightLines:
         ids, landmarks = known[image.chaser]
         found = landmarks[np.isin(ids, image.ids)]
         numbers.append(found)
-        cameras.append(np.tile(_camera_in_target(message, image), (len(found), 1)))
+        place, q = pose_at(message, image.sim_time_ns)
+        camera = rotations.rotate_inverse(q, np.array(image.position_m) - place)
+        cameras.append(np.tile(camera, (len(found), 1)))
     if not numbers:
         return SightLines(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
     return SightLines(np.concatenate(numbers), np.concatenate(cameras)).thinned()
-
-
-def _camera_in_target(message: LandmarkMap, image: FeatureTracks) -> Array:
-    """Return the optical centre (3,) of an image in TRF, by the motion of the map."""
-    motion = message.motion
-    assert motion is not None
-    elapsed_s = (image.sim_time_ns - message.sim_time_ns) / 1e9
-    q = rotations.integrate(np.array(motion.q_wxyz), np.array(motion.omega_rad_s), elapsed_s)
-    place = np.array(motion.position_m) + elapsed_s * np.array(motion.velocity_m_s)
-    return rotations.rotate_inverse(q, np.array(image.position_m) - place)

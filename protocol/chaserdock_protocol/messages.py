@@ -927,6 +927,17 @@ class PortRequest(Struct, frozen=True, kw_only=True):
     find: Literal["flat"] | None = None
     operator: Text = ""
 
+    @property
+    def says_one_place(self) -> bool:
+        """Whether it says where in exactly one way."""
+        return one_place(self.image, self.pixel, self.point_m, self.find)
+
+
+def one_place(image: object, pixel: object, point_m: object, find: object) -> bool:
+    """Return whether the parts of a ``PortRequest`` that are not None say one place."""
+    wanted = sum(part is not None for part in (pixel, point_m, find))
+    return wanted == 1 and (image is None) == (pixel is None)
+
 
 class CommandReply(Message, frozen=True, kw_only=True):
     """Reply of the controller to an operator command, also published for the log; of the mapper to

@@ -7,7 +7,8 @@ a scenario received over the network cannot load other code.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
@@ -64,15 +65,9 @@ def make(kind: Kind, name: str, own: tuple[str, ...], *arguments: Any) -> Any:
     it raises an error.
     """
     factory = load(kind, name, own)
-    try:
+    with _starting(kind, name):
         part = factory(*arguments)
         missing = [name for name in _MEMBERS[kind] if not hasattr(part, name)]
-    except ChaserdockError:
-        raise
-    except Exception as error:  # a plugin may raise anything
-        raise PluginError(
-            f"{kind} {name!r} does not start: {type(error).__name__}: {error}"
-        ) from error
     if missing:
         raise PluginError(f"{kind} {name!r} has no member {missing[0]}, which it must have")
     return part
@@ -82,10 +77,16 @@ def prepare(kind: Kind, name: str, part: Any, *arguments: Any) -> None:
     """Call ``part.prepare(*arguments)``, if the part has it. Raises PluginError if that raises
     another error than a ChaserdockError.
     """
-    if not hasattr(part, "prepare"):
-        return
+    if hasattr(part, "prepare"):
+        with _starting(kind, name):
+            part.prepare(*arguments)
+
+
+@contextmanager
+def _starting(kind: Kind, name: str) -> Iterator[None]:
+    """Turn what a plugin raises within, but a ChaserdockError, into a PluginError."""
     try:
-        part.prepare(*arguments)
+        yield
     except ChaserdockError:
         raise
     except Exception as error:  # a plugin may raise anything

@@ -22,7 +22,7 @@ from harness import ROOT
 from numpy.typing import NDArray
 
 from chaserdock.cli.main import app
-from chaserdock.datasets.sequences import _colmap_camera, export_sequence
+from chaserdock.datasets.sequences import colmap_camera, export_sequence
 from chaserdock.datasets.types import DatasetError, check_camera
 from chaserdock.logs import open_log
 
@@ -147,11 +147,11 @@ def test_lenses_that_a_layout_cannot_state_are_refused() -> None:
     prism = replace(rational, distortion=(*rational.distortion, 0.0, 0.0, 0.0, 1e-3))
     with pytest.raises(DatasetError, match=r"colmap has 0 to 8 .*with 12$"):
         check_camera(prism, "colmap")
-    assert _colmap_camera(camera) == "OPENCV 64 48 50.0 51.0 31.5 24.5 -0.2 0.05 0.001 0.002"
-    assert _colmap_camera(fisheye).startswith("OPENCV_FISHEYE 64 48 50.0 51.0 31.5 24.5 -0.2 ")
-    assert _colmap_camera(rational).split()[-4:] == ["0.01", "0.1", "0.02", "0.001"]
+    assert colmap_camera(camera) == "OPENCV 64 48 50.0 51.0 31.5 24.5 -0.2 0.05 0.001 0.002"
+    assert colmap_camera(fisheye).startswith("OPENCV_FISHEYE 64 48 50.0 51.0 31.5 24.5 -0.2 ")
+    assert colmap_camera(rational).split()[-4:] == ["0.01", "0.1", "0.02", "0.001"]
     five = replace(camera, distortion=(*camera.distortion, 0.01))
-    assert _colmap_camera(five).split()[-4:] == ["0.01", "0.0", "0.0", "0.0"]
+    assert colmap_camera(five).split()[-4:] == ["0.01", "0.0", "0.0", "0.0"]
 
 
 @pytest.mark.parametrize(

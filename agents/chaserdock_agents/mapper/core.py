@@ -209,7 +209,7 @@ class MapperCore:
         self._status = found.status
         if self._closed and not before:
             what = "map of the target: its loop has closed"
-            events.append(event_of(message, what, _known(message)))
+            events.append(_event_of(message, what, _known(message)))
         if message.motion is not None:
             self._map = message
             if self._closed:
@@ -225,11 +225,8 @@ class MapperCore:
         """Answer an operator who points at a place; any thread may ask. The port, if it becomes
         one, is in the next map.
         """
-        wanted = [request.pixel, request.point_m, request.find]
         newest = self._map
-        if sum(w is not None for w in wanted) != 1 or (request.pixel is None) != (
-            request.image is None
-        ):
+        if not request.says_one_place:
             decision = PortDecision(False, "give image and pixel, or a point, or what to find")
         elif newest is None:
             decision = PortDecision(False, f"no map of the target: {self._status or 'gathering'}")
@@ -287,12 +284,8 @@ class MapperCore:
         if where.image is None or where.image >= len(self._images):
             return None
         of_timeline = isinstance(where, PortChoice)
-        images = [
-            image
-            for image in tuple(self._images[where.image])
-            if not of_timeline or image.tick <= newest.tick
-        ]
-        return images[-1] if images else None
+        images = reversed(tuple(self._images[where.image]))
+        return next((i for i in images if not of_timeline or i.tick <= newest.tick), None)
 
     def _points(self, found: TargetMap, message: LandmarkMap) -> MappedPoints:
         """Return the landmarks of a map in its frame, and from where they were seen."""
@@ -415,15 +408,15 @@ def _event(message: LandmarkMap) -> Event:
     if message.motion is not None:
         detail = f"{_known(message)}; {detail}" if detail else _known(message)
     calm = message.status in ("gathering", "mapped")
-    return event_of(message, f"map of the target: {message.status}", detail, calm)
+    return _event_of(message, f"map of the target: {message.status}", detail, calm)
 
 
 def _port_event(message: LandmarkMap, chaser: int, decision: PortDecision) -> Event:
     what = f"port of chaser {chaser}: {'chosen' if decision.accepted else 'refused'}"
-    return event_of(message, what, decision.answer, decision.accepted)
+    return _event_of(message, what, decision.answer, decision.accepted)
 
 
-def event_of(message: LandmarkMap, what: str, detail: str, calm: bool = True) -> Event:
+def _event_of(message: LandmarkMap, what: str, detail: str, calm: bool = True) -> Event:
     """Return an event of the mapper at the time of a map."""
     return Event(
         tick=message.tick,

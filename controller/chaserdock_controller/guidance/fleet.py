@@ -15,7 +15,6 @@ from chaserdock_protocol.scenario.planar import why_not_planar
 from chaserdock_controller.interfaces import LogEntry
 
 from . import command_validation as validation
-from .approach_line import why_not_past
 from .chaser_machine import ChaserMachine
 from .chaser_state import ChaserTick, CommandResult, PhaseChange
 from .moves import MovePlanner
@@ -131,8 +130,8 @@ class ChaserFleet:
             return chaser.phase in (Phase.SURVEY, Phase.GOTO)
         if command.offset_m is not None or chaser.phase is not Phase.SURVEY:
             return False
-        here_m = chaser.motion(now_s).at(np.array([now_s]))[0][0]
-        return chaser.port is None or bool(why_not_past(self.scenario, here_m, chaser.line.entry_m))
+        entry_m = chaser.line.entry_m
+        return chaser.port is None or bool(self.moves.why_not_past(chaser, entry_m, now_s))
 
     def apply(self, commands: Sequence[OperatorCommand], now_s: float) -> list[CommandResult]:
         """Execute or refuse the commands of one tick. All goals are known in advance, so that two

@@ -7,6 +7,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario import FlightScenario
 
+from .approach_line import why_not_past
 from .chaser_machine import ChaserMachine
 from .escape import EscapePlanner
 from .parameters import GUIDANCE
@@ -57,6 +58,13 @@ class MovePlanner:
             f"{self._scenario.limits.min_distance_target_m:g} m of the target "
             "(limits.passive_safety, limits.passive_safety_force_N)"
         )
+
+    def why_not_past(self, chaser: ChaserMachine, goal_m: Array, now_s: float) -> str:
+        """Return why the straight way to a goal (3,), TRF, is too near to the target; empty if it
+        is not.
+        """
+        here_m = chaser.motion(now_s).at(np.array([now_s]))[0][0]
+        return why_not_past(self._scenario, here_m, goal_m)
 
     def _safe(
         self, chaser: ChaserMachine, goal_m: Array, now_s: float, speed_m_s: float

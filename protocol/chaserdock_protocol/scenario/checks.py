@@ -359,8 +359,8 @@ def _check_unknown_target(scenario: FlightScenario) -> None:
 def _check_chosen_ports(scenario: FlightScenario) -> None:
     """Check that ports are chosen on unknown targets only, and that every `goto` has a goal."""
     chosen: set[int] = set()
-    for entry in sorted(scenario.timeline, key=lambda entry: entry.at_s):
-        path = f"timeline.{scenario.timeline.index(entry)}"
+    for k, entry in sorted(enumerate(scenario.timeline), key=lambda row: row[1].at_s):
+        path = f"timeline.{k}"
         if (
             entry.command == "goto"
             and entry.offset_m is None

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from chaserdock_protocol.messages import one_place
+
 from .fields import Index, NotNegative, Positive, Section, Vector
 
 WorkSeconds = Annotated[float, Field(ge=0.2, le=60, allow_inf_nan=False)]
@@ -63,7 +65,6 @@ class PortChoice(Section):
 
     @model_validator(mode="after")
     def _check_one(self) -> PortChoice:
-        given = [self.pixel, self.point_m, self.find]
-        if sum(g is not None for g in given) != 1 or (self.pixel is None) != (self.image is None):
+        if not one_place(self.image, self.pixel, self.point_m, self.find):
             raise ValueError("needs either image and pixel, or point_m, or find")
         return self

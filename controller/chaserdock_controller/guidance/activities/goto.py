@@ -6,12 +6,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from chaserdock_models.arrays import Array, length
+from chaserdock_models.arrays import length
 from chaserdock_protocol.messages import OperatorCommand
 from numpy.typing import ArrayLike
 
 from .. import command_validation as validation
-from ..approach_line import approach_line, why_not_past
+from ..approach_line import approach_line
 from ..chaser_machine import Activity, ChaserMachine
 from ..chaser_state import Cause, ChaserGuidance, ChaserTick, TrackingErrors
 from ..fleet import ChaserFleet
@@ -54,9 +54,10 @@ class GotoActivity(Activity):
             reason := validation.why_not_closed(scenario, chaser.sighted)
         ):
             return reason
-        if command.offset_m is None and (reason := self._why_not_to_port(chaser, goal_m, now_s)):
+        moves = self._fleet.moves
+        if command.offset_m is None and (reason := moves.why_not_past(chaser, goal_m, now_s)):
             return reason
-        return validation.why_not_in_cone(scenario, i, goal_m) or self._fleet.moves.why_not_safe(
+        return validation.why_not_in_cone(scenario, i, goal_m) or moves.why_not_safe(
             chaser, goal_m, now_s
         )
 
@@ -65,10 +66,6 @@ class GotoActivity(Activity):
         if (sighted := chaser.sighted) is not None and sighted.port is not None:
             chaser.use_port(sighted.port)
         chaser.fire(Trigger.COMMAND_GOTO, now_s, place_m=goal_m)
-
-    def _why_not_to_port(self, chaser: ChaserMachine, goal_m: Array, now_s: float) -> str:
-        here_m = chaser.motion(now_s).at(np.array([now_s]))[0][0]
-        return why_not_past(chaser.scenario, here_m, goal_m)
 
     def enter(self, chaser: ChaserMachine, begun: ChaserGuidance, cause: Cause) -> ChaserGuidance:
         """Begin the commanded move. A chaser that has searched flies from its present place to its

@@ -20,11 +20,14 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.plant import PrincipalFrame
 from numpy.typing import NDArray
 
+from .images import BatchImages
 from .native import LIBRARY, function
 from .task import TrainingTask, task_of
 
 Floats = NDArray[np.float32]
 Booleans = NDArray[np.bool_]
+ObservationArray = NDArray[Any]
+"""float32, or uint8 for images."""
 
 
 @LIBRARY.structure("Batch")
@@ -45,12 +48,12 @@ class _State(ctypes.Structure):
 class BatchStep:
     """What a step of n environments with m chasers gave.
 
-    ``observations`` (n, m, width); ``rewards``, ``terminated``, ``truncated`` and ``outcomes``
-    (n, m), the last by their index in ``OUTCOMES``; ``rejected`` (n,): actions of the episode that
-    were not finite, and were taken as zero.
+    ``observations`` (n, m, width), or images (n, m, h, w, 1); ``rewards``, ``terminated``,
+    ``truncated`` and ``outcomes`` (n, m), the last by their index in ``OUTCOMES``; ``rejected``
+    (n,): actions of the episode that were not finite, and were taken as zero.
     """
 
-    observations: Floats
+    observations: ObservationArray
     rewards: Array
     terminated: Booleans
     truncated: Booleans
@@ -90,8 +93,10 @@ class DockingBatch:
         self._arrays = a
         self._state = _State(*(location(a[field[0]]) for field in _State._fields_))
         self._step, self._start = function("step_batch"), function("start_batch")
+        images = self.task.learning.observation == "images"
+        self._images = BatchImages(scenario, environments) if images else None
 
-    def start(self, seed: int | None = None, chosen: Booleans | None = None) -> Floats:
+    def start(self, seed: int | None = None, chosen: Booleans | None = None) -> ObservationArray:
         """Start all environments, or those ``chosen`` (n,), and return the observations.
 
         ``seed``: of all random numbers from now on, of every environment; by default they go on.
@@ -108,7 +113,7 @@ class DockingBatch:
         done[:] = True if chosen is None else chosen
         self._start(byref(self.task.numbers), byref(self._state))
         done |= waiting
-        return self._arrays["observations"].copy()
+        return self._observations()
 
     def step(self, actions: NDArray[np.floating]) -> BatchStep:
         """Fly all environments for a tick with actions (n, m, actuators).
@@ -124,7 +129,7 @@ class DockingBatch:
         self._step(byref(self.task.numbers), byref(self._state))
         n, m = self.environments, self.chasers
         return BatchStep(
-            a["observations"].copy(),
+            self._observations(),
             a["rewards"][: n * m].reshape(n, m).copy(),
             a["terminated"].astype(bool),
             a["truncated"].astype(bool),
@@ -141,9 +146,27 @@ class DockingBatch:
 
     def state(self, environment: int, chaser: int | None) -> BodyState:
         """Return the motion of a chaser, or of the target for None."""
-        rows, column = self._arrays["targets"], environment
-        if chaser is not None:
-            rows, column = self._arrays["bodies"], environment * self.chasers + chaser
-        y = rows[:, column].copy()
-        frame = PrincipalFrame(y[23:27], y[27:30])
-        return frame.to_body(BodyState(y[0:3], y[3:6], y[6:10], y[10:13]))
+        if chaser is None:
+            return self._motions("targets", slice(environment, environment + 1))[0]
+        column = environment * self.chasers + chaser
+        return self._motions("bodies", slice(column, column + 1))[0]
+
+    def _motions(self, bodies: str, columns: slice) -> list[BodyState]:
+        """Return the motions of bodies by the columns of their array."""
+        y = self._arrays[bodies][:, columns].T.copy()
+        frame = PrincipalFrame(y[:, 23:27], y[:, 27:30])
+        s = frame.to_body(BodyState(y[:, 0:3], y[:, 3:6], y[:, 6:10], y[:, 10:13]))
+        return [
+            BodyState(*row)
+            for row in zip(s.position_m, s.velocity_m_s, s.q_wxyz, s.omega_rad_s, strict=True)
+        ]
+
+    def _observations(self) -> ObservationArray:
+        """Return what the chasers observe now, (n, m, ...)."""
+        if self._images is None:
+            return self._arrays["observations"].copy()
+        n, m = self.environments, self.chasers
+        targets = self._motions("targets", slice(n))
+        chasers = self._motions("bodies", slice(n * m))
+        states = [[target, *chasers[e * m : e * m + m]] for e, target in enumerate(targets)]
+        return self._images.take(states, self._arrays["age"], self._arrays["random"])

@@ -12,7 +12,7 @@ from gymnasium.spaces import Space
 from pettingzoo import ParallelEnv
 
 from . import loaded
-from .batch import DockingBatch, Floats
+from .batch import DockingBatch, Floats, ObservationArray
 from .scene import RENDER_MODES, EnvironmentView, RgbImage
 from .spaces import action_space, observation_space, require_finite
 from .task import OUTCOMES, SUCCESSES
@@ -23,7 +23,7 @@ _METADATA: dict[str, Any] = {
 }
 
 
-class DockingParallelEnv(ParallelEnv[str, Floats, Floats]):
+class DockingParallelEnv(ParallelEnv[str, ObservationArray, Floats]):
     """See ``chaserdock.envs.parallel_env``. Agents are ``chaser_0``, ``chaser_1``, ...
 
     A docked chaser leaves the agents and moves with the target, whose motion it does not change. A
@@ -46,7 +46,7 @@ class DockingParallelEnv(ParallelEnv[str, Floats, Floats]):
         self.action_spaces = {a: action_space(task) for a in self.possible_agents}
         self._started = False
 
-    def observation_space(self, agent: str) -> Space[Floats]:
+    def observation_space(self, agent: str) -> Space[ObservationArray]:
         """Return the space of an agent's observations."""
         return self.observation_spaces[agent]
 
@@ -56,7 +56,7 @@ class DockingParallelEnv(ParallelEnv[str, Floats, Floats]):
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Floats], dict[str, dict[str, Any]]]:
+    ) -> tuple[dict[str, ObservationArray], dict[str, dict[str, Any]]]:
         """Start an episode; ``seed``: see ``DockingBatch.start``. There are no ``options``."""
         if not self._started and seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
@@ -69,7 +69,7 @@ class DockingParallelEnv(ParallelEnv[str, Floats, Floats]):
     def step(
         self, actions: dict[str, Floats]
     ) -> tuple[
-        dict[str, Floats],
+        dict[str, ObservationArray],
         dict[str, float],
         dict[str, bool],
         dict[str, bool],

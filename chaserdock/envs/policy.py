@@ -29,8 +29,16 @@ class PolicyError(ChaserdockError):
 
 
 def facts_of(task: TrainingTask) -> dict[str, str]:
-    """Return the metadata of a policy that is trained for a task."""
+    """Return the metadata of a policy that is trained for a task.
+
+    Raises PolicyError for a task with images: flight software hands estimates to a policy.
+    """
     scenario = task.scenario
+    if task.learning.observation == "images":
+        raise PolicyError(
+            f"{scenario.name}: learning.observation: a policy that flies takes estimates, "
+            '"truth" or "statistical" (got "images")'
+        )
     return {
         "task": TASKS[task.numbers.task],
         "observation": json.dumps(names_of(len(scenario.chasers))),

@@ -10,7 +10,7 @@ import gymnasium
 from chaserdock_protocol.scenario import Scenario
 
 from . import loaded
-from .batch import DockingBatch, Floats
+from .batch import DockingBatch, Floats, ObservationArray
 from .scene import RENDER_MODES, EnvironmentView, RgbImage
 from .spaces import action_space, observation_space, require_finite, require_one_chaser
 from .task import OUTCOMES, SUCCESSES
@@ -18,7 +18,7 @@ from .task import OUTCOMES, SUCCESSES
 _METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES)}
 
 
-class DockingEnv(gymnasium.Env[Floats, Floats]):
+class DockingEnv(gymnasium.Env[ObservationArray, Floats]):
     """See ``chaserdock.envs.make``.
 
     ``info["outcome"]``: one of ``OUTCOMES``; ``info["is_success"]``: docked, or held to the end.
@@ -39,7 +39,7 @@ class DockingEnv(gymnasium.Env[Floats, Floats]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats, dict[str, Any]]:
+    ) -> tuple[ObservationArray, dict[str, Any]]:
         """Start an episode; ``seed``: see ``DockingBatch.start``. There are no ``options``."""
         super().reset(seed=seed)
         if not self._started and seed is None:
@@ -47,7 +47,7 @@ class DockingEnv(gymnasium.Env[Floats, Floats]):
         self._started = True
         return self._batch.start(seed)[0, 0], {"outcome": OUTCOMES[0], "is_success": False}
 
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Floats) -> tuple[ObservationArray, float, bool, bool, dict[str, Any]]:
         """Fly for a tick. Raises ValueError for an action of another shape or with numbers that are
         not finite.
         """

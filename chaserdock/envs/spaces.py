@@ -10,14 +10,18 @@ from chaserdock_protocol.errors import ScenarioError
 from chaserdock_protocol.scenario import Scenario
 from gymnasium.spaces import Box, Space
 
-from .batch import Floats
+from .batch import Floats, ObservationArray
 from .task import TrainingTask
 
 
-def observation_space(task: TrainingTask) -> Space[Floats]:
+def observation_space(task: TrainingTask) -> Space[ObservationArray]:
     """Return the space of an observation (width,), not limited; the elements are listed in
-    docs/learning.md.
+    docs/learning.md. Of images (h, w, 1): grey levels.
     """
+    if task.learning.observation == "images":
+        camera = task.scenario.camera
+        grey: Any = Box(0, 255, (camera.height_px, camera.width_px, 1), np.uint8)
+        return grey
     box: Any = Box(-np.inf, np.inf, (task.width,), np.float32)
     return box
 

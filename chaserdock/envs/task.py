@@ -382,10 +382,10 @@ def _solids(scenario: Scenario) -> Array:
 
 def _sensor(scenario: Scenario, places: ctypes.Array[_Place]) -> tuple[Array, Array]:
     """Return distances of the sensor's table, and the table for the first chaser; both without
-    meaning for the observation ``truth``.
+    meaning but for the observation ``statistical``.
     """
     learning = scenario.learning
-    if learning is None or learning.observation == "truth":
+    if learning is None or learning.observation != "statistical":
         return np.arange(2.0), np.zeros((2, 6, 9))
     goal = np.array(places[0].goal_m)
     start_m = np.linalg.norm(np.array(places[0].start_m) - scenario.target.position_m)

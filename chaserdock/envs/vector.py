@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from . import loaded
-from .batch import DockingBatch, Floats
+from .batch import DockingBatch, Floats, ObservationArray
 from .scene import RENDER_MODES, EnvironmentView, RgbImage
 from .spaces import action_space, observation_space, require_one_chaser
 from .task import SUCCESSES
@@ -24,7 +24,7 @@ _METADATA: dict[str, Any] = {
 }
 
 
-class DockingVectorEnv(VectorEnv[Floats, Floats, NDArray[Any]]):
+class DockingVectorEnv(VectorEnv[ObservationArray, Floats, NDArray[Any]]):
     """See ``chaserdock.envs.make_vec``. What is done starts anew with the next step.
 
     ``info["outcome"]`` (n,): index in ``OUTCOMES`` (task.py); ``info["is_success"]`` (n,): docked,
@@ -51,7 +51,7 @@ class DockingVectorEnv(VectorEnv[Floats, Floats, NDArray[Any]]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats, dict[str, Any]]:
+    ) -> tuple[ObservationArray, dict[str, Any]]:
         """Start all episodes; ``seed``: see ``DockingBatch.start``. There are no ``options``."""
         super().reset(seed=seed)
         if not self._started and seed is None:
@@ -65,7 +65,7 @@ class DockingVectorEnv(VectorEnv[Floats, Floats, NDArray[Any]]):
 
     def step(
         self, actions: Floats
-    ) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+    ) -> tuple[ObservationArray, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Fly all for a tick with actions (n, actuators). Raises ValueError for another shape."""
         given = np.asarray(actions)
         if given.shape != self.action_space.shape:

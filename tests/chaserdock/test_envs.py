@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import subprocess
 import sys
@@ -15,14 +16,17 @@ import numpy as np
 import pytest
 from chaserdock_protocol.errors import ChaserdockError, ScenarioError
 from chaserdock_protocol.scenario import Scenario, parse_scenario
-from env_cases import ALONG_PORT, SEVERAL, START, along_port, docking
+from chaserdock_world.rendering.cameras import Cameras
+from env_cases import ALONG_PORT, SEVERAL, START, along_port, docking, learning
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 from harness import ROOT
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from chaserdock import envs
-from chaserdock.envs.task import OUTCOMES
+from chaserdock.envs.batch import DockingBatch
+from chaserdock.envs.policy import facts_of
+from chaserdock.envs.task import OUTCOMES, task_of
 
 IDEAL = 'chaser.actuation="ideal"'
 
@@ -153,6 +157,59 @@ def test_a_team_ends_together_and_then_needs_a_reset() -> None:
     assert environment.step({}) == ({}, {}, {}, {}, {})
     with pytest.raises(ValueError, match="the episode is over"):
         environment.step(zeros)
+
+
+SMALL = ("camera.width_px=80", "camera.height_px=64", 'chaser.actuation="ideal"')
+NO_NOISE = ("camera.effects.read_noise=0.0", "camera.effects.shot_noise=0.0")
+
+
+def test_images_are_those_of_the_cameras_of_the_world() -> None:
+    scenario = docking(*SMALL, *NO_NOISE, observation="images", start=START)
+    batch = DockingBatch(scenario, 3)
+    images = batch.start(4)
+    for _ in range(3):
+        images = batch.step(np.full((3, 1, 6), 0.3)).observations
+    for e in range(3):
+        bodies = {"target": batch.state(e, None), "chaser/0": batch.state(e, 0)}
+        seen = Cameras(scenario).render(0, 0, 3 * 10**9 // scenario.time.rate_hz, bodies)
+        np.testing.assert_array_equal(images[e, 0, :, :, 0], seen)
+    assert (images[0] != images[1]).mean() > 0.01  # they start elsewhere
+
+
+def test_images_come_at_their_rate_and_repeat_with_the_seed() -> None:
+    scenario = docking(*SMALL, "time.rate_hz=15", "time.image_hz=5", observation="images")
+    environments = envs.make_vec(scenario, 2)
+    actions = np.zeros((2, 6), np.float32)
+
+    def episode() -> Any:
+        return [environments.reset(seed=5)[0], *(environments.step(actions)[0] for _ in range(6))]
+
+    first, again = episode(), episode()
+    np.testing.assert_array_equal(first, again)
+    changed = [bool((a != b).any()) for a, b in itertools.pairwise(first)]
+    assert changed == [False, False, True, False, False, True]
+    assert (first[0][0] != first[0][1]).any()  # noise of its own
+    alone = envs.make_vec(scenario, 1)
+    np.testing.assert_array_equal(alone.reset(seed=5)[0], first[0][:1])
+
+
+def test_checkers_accept_images() -> None:
+    scenario = docking(*SMALL, observation="images", start=START)
+    environment = envs.make(scenario)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        check_env(environment, skip_render_check=True)
+    assert [str(w.message) for w in said] == []
+    assert environment.observation_space.shape == (64, 80, 1)
+    team = several(
+        learning=learning(observation="images"), camera={"width_px": 80, "height_px": 64}
+    )
+    parallel_api_test(envs.parallel_env(team), num_cycles=5)
+
+
+def test_a_policy_of_images_does_not_fly() -> None:
+    with pytest.raises(ChaserdockError, match="takes estimates"):
+        facts_of(task_of(docking(*SMALL, observation="images"), 1))
 
 
 def test_invalid_actions_are_one_line() -> None:

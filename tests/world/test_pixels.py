@@ -125,7 +125,10 @@ def test_a_supersampled_image_is_blurred_and_averaged_to_a_rounding(
         assert abs(np.mean(got - exact)) < 0.15
 
 
-def test_stars_at_the_border_and_beside_each_other_are_blurred_as_the_whole_image_is():
+def test_stars_at_the_border_and_beside_each_other_are_blurred_as_the_whole_image_is(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(lens, "_STAR_PIXELS", 0)
     image = np.full((30, 40), background.SPACE_LEVEL, dtype=np.uint8)
     at = np.array([[0, 0], [39, 0], [1, 28], [39, 29], [20, 15], [21, 15], [23, 17], [20, 15]])
     image[at[:, 1], at[:, 0]] = [180, 90, 120, 60, 200, 150, 30, 201]

@@ -87,10 +87,10 @@ class LearningSection(Section):
         description="`hold`: stay at the reference pose. `dock`: come to the docking distance or "
         "into the port, as `docking.kind` says."
     )
-    observation: Literal["truth", "statistical"] = Field(
+    observation: Literal["truth", "statistical", "images"] = Field(
         default="truth",
-        description="`truth`, or `statistical`: with the errors that a filter of the statistical "
-        "perception's measurements has.",
+        description="`truth`; `statistical`: with the errors that a filter of the statistical "
+        "perception's measurements has; `images`: what the camera sees.",
     )
     episode_s: Positive = Field(description="Longest episode, s. At least a tick.")
     start: LearningStart = LearningStart()

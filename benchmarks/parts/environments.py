@@ -27,7 +27,8 @@ _IMAGE_ENVIRONMENTS = 32
 _IMAGES = ("camera.width_px=64", "camera.height_px=64")
 
 
-def _scenario(actuation: str, observation: str, sets: list[str]) -> Scenario:
+def task_scenario(actuation: str, observation: str, sets: list[str]) -> Scenario:
+    """Return `docking-contact` with a training task and plant mismatch."""
     overrides = (
         _TASK.format(observation=observation),
         f'chaser.actuation="{actuation}"',
@@ -37,7 +38,7 @@ def _scenario(actuation: str, observation: str, sets: list[str]) -> Scenario:
     return load_scenario(shipped_scenario("docking-contact"), overrides)
 
 
-def _steps_per_s(
+def steps_per_s(
     scenario: Scenario, environments: int, rounds: int, least_steps: int = 100_000
 ) -> tuple[float, float]:
     """Return the median number of agent steps in a second of processor time, and the share of steps
@@ -68,17 +69,17 @@ def environments(options: Options) -> Figures:
     rounds = 3 if options.quick else 9
     for actuation in ("ideal", "thrusters"):
         for observation in ("truth", "statistical"):
-            scenario = _scenario(actuation, observation, options.set)
-            rate, started = _steps_per_s(scenario, count, rounds)
+            scenario = task_scenario(actuation, observation, options.set)
+            rate, started = steps_per_s(scenario, count, rounds)
             name = f"{actuation}_{observation}"
             print(
                 f"{actuation:9} {observation:11} {count} environments  "
                 f"{rate / 1e6:5.2f} million steps/s, {started:.2%} of them starts",
                 flush=True,
             )
-            figures[f"{name}_steps_per_s"] = rate
-    images = _scenario("ideal", "images", [*_IMAGES, *options.set])
-    rate, _ = _steps_per_s(images, _IMAGE_ENVIRONMENTS, rounds, least_steps=0)
+            figures[f"{name}steps_per_s"] = rate
+    images = task_scenario("ideal", "images", [*_IMAGES, *options.set])
+    rate, _ = steps_per_s(images, _IMAGE_ENVIRONMENTS, rounds, least_steps=0)
     print(f"ideal     images      {_IMAGE_ENVIRONMENTS} environments  {rate:5.0f} steps/s")
     figures["images_steps_per_s"] = rate
     figures["environments"] = count

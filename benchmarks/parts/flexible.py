@@ -20,7 +20,7 @@ from chaserdock_world.physics.simulation import Physics
 from chaserdock_world.plant import chaser_plant
 from common import ROOT, BenchmarkFailed, Figures, Group, Options
 from flights.engine_comparison import ENGINES
-from peers.basilisk import run_basilisk
+from peers.interpreter import run_in
 
 REFERENCE = ROOT / "tests" / "world" / "basilisk_flexible.json"
 BAR_SHARE = 1e-4
@@ -201,7 +201,7 @@ def fly_in_basilisk(python: str) -> dict[str, list[dict[str, Any]]]:
         "seconds": SECONDS,
         "pulses": PULSES,
     }
-    flown = run_basilisk(python, _BASILISK, given)
+    flown = run_in(python, _BASILISK, given)
     return {
         name: [_led(row) | {"at_s": at} for at, row in zip(SECONDS, rows, strict=True)]
         for name, rows in zip(CASES, flown, strict=True)

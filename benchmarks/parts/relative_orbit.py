@@ -26,7 +26,7 @@ from chaserdock_models.orbit import (
 )
 from chaserdock_models.relative_motion import cw_transition, propagate_relative
 from common import ROOT, Figures, Group, Options
-from peers.basilisk import run_basilisk
+from peers.interpreter import run_in
 
 REFERENCE = ROOT / "tests" / "models" / "basilisk_relative_orbit.json"
 
@@ -123,7 +123,7 @@ def fly_in_basilisk(python: str, folder: Path) -> list[dict[str, Any]]:
                 "steps": case["duration_s"],
             }
         )
-    results = run_basilisk(python, _BASILISK, given)
+    results = run_in(python, _BASILISK, given)
     for case, result in zip(flown, results, strict=True):
         orbit, body = (OrbitState(*map(np.array, s)) for s in result["states"])
         case["duration_s"] = result["duration_s"]

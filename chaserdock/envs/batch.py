@@ -34,9 +34,9 @@ class _State(ctypes.Structure):
     _fields_ = [
         (name, c_void_p)
         for name in (
-            "bodies", "targets", "wrench", "memory", "docked", "errors", "work", "pulse", "opened",
-            "age", "plant", "done", "outcome", "random", "actions", "observations", "rewards",
-            "terminated", "truncated", "rejected", "idle",
+            "bodies", "targets", "wrench", "memory", "docked", "errors", "unseen", "work", "pulse",
+            "opened", "age", "plant", "done", "outcome", "random", "actions", "observations",
+            "rewards", "seen", "terminated", "truncated", "rejected", "idle",
         )
     ]  # fmt: skip
 
@@ -80,6 +80,8 @@ class DockingBatch:
         a["targets"] = np.zeros((30, t.target_pitch))
         for body in (a["bodies"], a["targets"]):
             body[[6, 13, 14, 15, 16, 23]] = 1.0  # bodies that fill up the last four
+        a["unseen"] = np.zeros((n, t.surface.faces, 4))
+        a["seen"] = np.zeros((n, t.surface.points), np.uint8)
         a["work"] = np.zeros(24 * t.steps)
         a["outcome"] = np.zeros((n, m), np.int64)
         a["random"] = np.zeros(n, np.uint64)
@@ -131,6 +133,13 @@ class DockingBatch:
             a["outcome"].copy(),
             a["rejected"].copy(),
         )
+
+    @property
+    def seen(self) -> Booleans:
+        """Which points (n, points) of the target's surface were seen in the episode, in the order
+        of ``surface_of``; without a meaning for other tasks than ``inspect``.
+        """
+        return self._arrays["seen"].astype(bool)
 
     @property
     def plants(self) -> IntArray:

@@ -33,7 +33,7 @@ def facts_of(task: TrainingTask) -> dict[str, str]:
     scenario = task.scenario
     return {
         "task": TASKS[task.numbers.task],
-        "observation": json.dumps(names_of(len(scenario.chasers))),
+        "observation": json.dumps(names_of(len(scenario.chasers), TASKS[task.numbers.task])),
         "actuation": scenario.chaser.actuation,
         "actuators": str(task.actuators),
         "rate_hz": str(float(scenario.time.rate_hz)),
@@ -75,7 +75,7 @@ class Policy:
 
     def check(self, scenario: Scenario | FlightScenario) -> None:
         """Raise PolicyError if the policy is not for the chasers of a scenario."""
-        needed = names_of(len(scenario.chasers))
+        needed = names_of(len(scenario.chasers), self.task)
         if self.names != needed:
             where = next(
                 (k for k, pair in enumerate(zip(self.names, needed, strict=False))

@@ -606,7 +606,7 @@ def test_a_scenario_without_the_table_is_one_line() -> None:
 @pytest.mark.parametrize(
     ("table", "text"),
     [
-        ({"task": "juggle"}, "learning.task: must be one of hold, dock"),
+        ({"task": "juggle"}, "learning.task: must be one of hold, dock, inspect"),
         ({"episode_s": 0.01}, "learning.episode_s: 0.01 s is shorter than a tick"),
         ({"start": {"position_m": [0.6, 0.0, 0.0]}},
          "learning.start.position_m: chaser 0 could start 0.401 m from the target"),

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from chaserdock_protocol.errors import ChaserdockError, ScenarioError
 from chaserdock_protocol.scenario import Scenario, parse_scenario
-from env_cases import ALONG_PORT, SEVERAL, START, along_port, docking
+from env_cases import ALONG_PORT, SEVERAL, START, along_port, docking, learning
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 from harness import ROOT
@@ -33,9 +33,10 @@ def several(**changes: Any) -> Scenario:
     return parse_scenario(values, "test")
 
 
+@pytest.mark.parametrize("task", ["dock", "inspect"])
 @pytest.mark.parametrize("actuation", ["ideal", "thrusters"])
-def test_gymnasium_accepts_an_environment(actuation: str) -> None:
-    scenario = docking(f'chaser.actuation="{actuation}"', start=START)
+def test_gymnasium_accepts_an_environment(actuation: str, task: str) -> None:
+    scenario = docking(f'chaser.actuation="{actuation}"', task=task, start=START)
     environment = envs.make(scenario, render_mode="rgb_array")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -107,7 +108,12 @@ def test_seeds_repeat_and_starts_without_one_differ() -> None:
 def test_pettingzoo_accepts_environments_of_one_to_sixteen_chasers() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for scenario in (docking(start=START, episode_s=3.0), several(), sixteen()):
+        for scenario in (
+            docking(start=START, episode_s=3.0),
+            several(),
+            several(learning=learning("inspect", episode_s=3.0)),
+            sixteen(),
+        ):
             parallel_api_test(envs.parallel_env(scenario), num_cycles=100)
             parallel_seed_test(lambda s=scenario: envs.parallel_env(s), num_cycles=20)
 
@@ -282,9 +288,14 @@ def test_the_proportional_law_of_the_example_docks() -> None:
     assert counts["docked"] >= 196
 
 
-@pytest.mark.parametrize("name", ["docking", "holding"])
+@pytest.mark.parametrize("name", ["docking", "holding", "inspecting"])
 def test_tasks_of_the_examples_have_rewards(name: str) -> None:
-    environment = envs.make(EXAMPLES / f"{name}.toml")
+    environment = envs.parallel_env(EXAMPLES / f"{name}.toml")
     environment.reset(seed=1)
-    rewards = [environment.step(environment.action_space.sample())[1] for _ in range(3)]
-    assert len({*rewards, 0.0}) == 4
+    for agent in environment.agents:
+        environment.action_space(agent).seed(1)
+    rewards = set[float]()
+    for _ in range(3):
+        actions = {a: environment.action_space(a).sample() for a in environment.agents}
+        rewards |= set(environment.step(actions)[1].values())
+    assert len({*rewards, 0.0}) >= 4

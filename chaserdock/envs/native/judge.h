@@ -5,6 +5,7 @@
 
 #include "observe.h"
 #include "probe.h"
+#include "surface.h"
 
 /* Fix a chaser that docks to its target, where it is. */
 static void fix_to_target(const Task *t, Batch *b, int64_t chaser, const Motion *target) {
@@ -73,8 +74,8 @@ static void judge(const Task *t, Batch *b, int64_t e) {
     const Weights *w = &t->weights;
     Motion target;
     Relative states[MAX_CHASERS];
-    double others[3 * MAX_CHASERS];
-    int failed = 0, flying = 0;
+    double others[3 * MAX_CHASERS], gained[MAX_CHASERS];
+    int failed = 0, flying = 0, complete = 0;
     read_motion(b->targets + e, t->target_pitch, &target);
     b->age[e]++;
     for (int64_t i = 0; i < count; i++) {
@@ -84,6 +85,7 @@ static void judge(const Task *t, Batch *b, int64_t e) {
         relative_motion(&m, &target, states + i);
         copy(states[i].r, others + 3 * i, 3);
     }
+    if (t->task == INSPECT) complete = inspect(t, b, e, states, &target, gained);
     for (int64_t i = 0; i < count; i++) {
         const int64_t chaser = first + i;
         double *reward = b->rewards + chaser;
@@ -105,6 +107,7 @@ static void judge(const Task *t, Batch *b, int64_t e) {
             if (k != i && dot3(apart, apart) < t->keep_chasers_m * t->keep_chasers_m)
                 event = TOO_NEAR;
         }
+        if (event == FLYING && complete) event = INSPECTED;
         if (event == FLYING && b->age[e] >= t->episode_ticks)
             event = t->task == HOLD && *ticks >= (double)t->held_ticks ? HELD : TIME_OUT;
         const ProbeLimits *limits = now.gap < t->final_m ? &t->final : &t->corridor;
@@ -114,11 +117,12 @@ static void judge(const Task *t, Batch *b, int64_t e) {
                   t->tick_s * (w->distance_per_m_s * now.away + w->angle_per_rad_s * now.turned +
                                w->time_per_s + (outside ? w->corridor_per_s : 0.0) -
                                (good ? w->within_per_s : 0.0));
-        if (event == DOCKED || event == HELD) *reward += w->success;
+        if (t->task == INSPECT) *reward += w->seen * gained[i];
+        if (event == DOCKED || event == HELD || event == INSPECTED) *reward += w->success;
         b->outcome[chaser] = event;
         if (event == DOCKED) fix_to_target(t, b, chaser, &target);
         b->terminated[chaser] = event == DOCKED || event == COLLIDED || event == TOO_NEAR ||
-                                event == LOST;
+                                event == LOST || event == INSPECTED;
         b->truncated[chaser] = event == HELD || event == TIME_OUT;
         failed |= event == COLLIDED || event == TOO_NEAR || event == LOST;
         flying |= event == FLYING;

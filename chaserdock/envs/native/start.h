@@ -5,6 +5,7 @@
 
 #include "observe.h"
 #include "probe.h"
+#include "surface.h"
 
 static inline void spread3(uint64_t *random, double half_width, double *out) {
     for (int i = 0; i < 3; i++) out[i] = half_width * next_uniform(random);
@@ -48,6 +49,7 @@ static void start(const Task *t, Batch *b, int64_t e) {
             b->pulse[chaser * t->actuators + j] = b->opened[chaser * t->actuators + j] = 0;
     }
     read_motion(b->targets + e, t->target_pitch, &target);
+    if (t->task == INSPECT) forget_surface(t, b, e);
     Relative states[MAX_CHASERS];
     for (int64_t number = 0; number < t->chasers; number++) {
         Motion m;

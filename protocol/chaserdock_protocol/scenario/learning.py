@@ -70,11 +70,48 @@ class LearningReward(Section):
         description="For each second within `approach.docked_position_m` and `docked_angle_deg`.",
     )
     time_per_s: Number = Field(default=0.0, description="Lost for each second.")
-    success: Number = Field(default=0.0, description="For docking, and for holding to the end.")
+    seen: Number = Field(
+        default=0.0,
+        description="`inspect`: for all points of the surface; each chaser gets the share of those "
+        "that it is the first to see.",
+    )
+    success: Number = Field(default=0.0, description="For the task's success.")
     failure: Number = Field(
         default=0.0,
         description="Lost by every chaser that still flies when one collides, comes too near or "
         "is lost.",
+    )
+
+
+class LearningInspection(Section):
+    """When a point of the target's surface counts as seen by the task `inspect`: in an image, near
+    enough, at no flat angle, hidden by no cuboid of the target, and sunlit.
+    """
+
+    share: float = Field(
+        default=0.95,
+        gt=0.0,
+        le=1.0,
+        allow_inf_nan=False,
+        description="Share of the points that all chasers together have to see.",
+    )
+    spacing_m: Positive = Field(
+        default=0.1, description="Largest distance of neighbouring points on a face, m."
+    )
+    range_m: Positive = Field(
+        default=2.0, description="Largest distance of a point from the camera, m."
+    )
+    incidence_deg: float = Field(
+        default=70.0,
+        gt=0.0,
+        le=90.0,
+        allow_inf_nan=False,
+        description="Largest angle between line of sight and normal of the face, degrees.",
+    )
+    sunlit: bool = Field(
+        default=True,
+        description="Whether a point must be in the light of `camera.sun_direction`, and in no "
+        "shadow of the target.",
     )
 
 
@@ -83,9 +120,9 @@ class LearningSection(Section):
     those of missions: `approach`, `docking`, `limits`.
     """
 
-    task: Literal["hold", "dock"] = Field(
+    task: Literal["hold", "dock", "inspect"] = Field(
         description="`hold`: stay at the reference pose. `dock`: come to the docking distance or "
-        "into the port, as `docking.kind` says."
+        "into the port, as `docking.kind` says. `inspect`: see the target's surface."
     )
     observation: Literal["truth", "statistical"] = Field(
         default="truth",
@@ -95,6 +132,7 @@ class LearningSection(Section):
     episode_s: Positive = Field(description="Longest episode, s. At least a tick.")
     start: LearningStart = LearningStart()
     reward: LearningReward = LearningReward()
+    inspect: LearningInspection = LearningInspection()
 
 
 def check_learning(scenario: Scenario) -> None:

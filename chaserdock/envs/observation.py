@@ -35,6 +35,7 @@ ADDED = {
         "seen_share",
         *(f"sun_{k}" for k in "xyz"),
     ),
+    "detumble": tuple(f"stack_velocity_{k}_m_s" for k in "xyz"),
 }
 """Elements that a task of ``TASKS`` (task.py) adds."""
 
@@ -62,12 +63,20 @@ def goal_of(scenario: Scenario | FlightScenario, chaser: int, task: str) -> Goal
     nominal = np.asarray(scenario.chasers[chaser].position_m, dtype=float)
     attitude = np.asarray(scenario.chasers[chaser].q_wxyz, dtype=float)
     port = scenario.docking.port_of(chaser)
-    if task == "latch" and port is not None:
+    if task in ("latch", "detumble") and port is not None:
         return Goal(centre_offset(port, scenario.chaser.probe_reach_m, 0.0), attitude)
     if task == "hold":
         return Goal(nominal, attitude)
     towards = nominal / np.linalg.norm(nominal)
     return Goal(towards * scenario.approach.dock_distance_m, attitude)
+
+
+def stack_elements(centre_m: Array, target: BodyState) -> Array:
+    """Return what ``detumble`` adds to an observation: velocity (3,) of the stack's centre of mass,
+    TRF axes, m/s. ``centre_m`` (3,): TRF, as ``stated_stack`` (stack.py) has it.
+    """
+    turning = rotations.cross(target.omega_rad_s, centre_m)
+    return rotations.rotate_inverse(target.q_wxyz, target.velocity_m_s) + turning
 
 
 def observation_of(
@@ -80,7 +89,7 @@ def observation_of(
     """Return the observation (16 + k + 3 n,) of a chaser: see docs/learning.md.
 
     ``others_m``: positions (3,), WRF, of the other chasers, by number. ``added`` (k,): what the
-    task adds, as ``Coverage.elements`` (surface.py).
+    task adds: ``Coverage.elements`` (surface.py), ``stack_elements``.
     """
     into_target = rotations.conjugate(target.q_wxyz)
     position = rotations.rotate(into_target, chaser.position_m - target.position_m)

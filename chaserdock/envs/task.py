@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable
 from ctypes import c_double, c_int64, c_void_p
 from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_controller.guidance.approach_cone import cone_of
+from chaserdock_controller.guidance.parameters import GUIDANCE
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.native import location
@@ -33,6 +35,13 @@ from ..analysis.criteria import nearest_allowed_m
 from .native import LIBRARY
 from .observation import goal_of, names_of
 from .sensor_errors import BINS, sensor_table
+from .stack import (
+    closed_thrusters,
+    columns_in_stack,
+    mounted_chasers,
+    stack_plant,
+    stated_stack,
+)
 from .surface import Surface, extent_m, surface_of
 
 PLANTS = 256
@@ -45,14 +54,14 @@ FASTEST_TURN_RAD = 0.2
 """Largest turn in a physics step: up to it the kernel's series are exact to rounding. A chaser that
 turns faster is lost.
 """
-TASKS = ("hold", "come", "latch", "inspect")
+TASKS = ("hold", "come", "latch", "inspect", "detumble")
 """Names of the tasks of native/batch.h, in its order."""
 OUTCOMES = (
     "flying", "docked", "held", "time out", "collision", "too near", "lost", "after others",
-    "inspected",
+    "inspected", "stopped",
 )  # fmt: skip
 """Names of the outcomes of native/batch.h, in its order."""
-SUCCESSES = (1, 2, 8)
+SUCCESSES = (1, 2, 8, 9)
 """Indices of the outcomes that are successes."""
 _BODY_ROWS = 17  # mass to centre of mass
 
@@ -99,6 +108,8 @@ class _Weights(ctypes.Structure):
         "within_per_s",
         "time_per_s",
         "seen",
+        "spin_per_rad_s",
+        "drift_per_m_s",
         "success",
         "failure",
     )
@@ -113,6 +124,13 @@ class _Surface(ctypes.Structure):
         *_doubles("range_m", "least_cosine", "extent_m", to_sun=3),
         *((name, c_void_p) for name in ("planes", "points_m", "totals", "first", "box")),
     ]
+
+
+@LIBRARY.structure("Stack")
+class _Stack(ctypes.Structure):
+    """Mirror `Stack` of native/batch.h."""
+
+    _fields_ = [*_doubles("speed_m_s", "rate_rad_s", centre_m=3), ("closed", c_void_p)]
 
 
 @LIBRARY.structure("Task")
@@ -136,6 +154,7 @@ class TaskNumbers(ctypes.Structure):
         *((name, _ProbeLimits) for name in ("corridor", "final", "contact")),
         ("weights", _Weights),
         ("surface", _Surface),
+        ("stack", _Stack),
         *_doubles(spread_m=3),
         *_doubles("spread_rad", "spread_m_s", "spread_rad_s", "target_spread_rad_s"),
         *_doubles(target_start=13, camera_m=3, camera_wxyz=4, view=4),
@@ -198,7 +217,8 @@ def task_of(scenario: Scenario, environments: int) -> TrainingTask:
     actuators = len(scenario.chaser.thrusters) if pulsed else 6
     step_s, tick_s = 1.0 / timing.physics_hz, 1.0 / timing.rate_hz
     places = (_Place * chasers)(*(_place(scenario, i, kind) for i in range(chasers)))
-    chaser_plants, target_plants = _plants(scenario, pulsed, actuators)
+    bodies = _stack_bodies if kind == "detumble" else _bodies
+    chaser_plants, target_plants = _plants(scenario, pulsed, actuators, bodies)
     solids = _solids(scenario)
     valves = _valve_tables(scenario) if pulsed else _NO_VALVES
     effort = _effort_N_s(scenario, pulsed, tick_s)
@@ -207,12 +227,14 @@ def task_of(scenario: Scenario, environments: int) -> TrainingTask:
     left, top, right, bottom = (math.tan(a) for a in camera.angles_to_borders())
     distances_m, sensor = _sensor(scenario, kind)
     surface, points = _surface(scenario, learning, kind)
+    stack, closed = _stack(scenario, pulsed, kind)
+    steady_s = GUIDANCE.stack_rest_s if kind == "detumble" else approach.docked_time_s
     arrays = (chaser_plants, target_plants, solids, *valves[:2], effort, sensor, *valves[2:])
     pointers = [ctypes.addressof(places), *map(location, arrays)]
     numbers = TaskNumbers(
         environments, chasers, _padded(count), _padded(environments), actuators, pulsed,
         timing.steps_per_tick, timing.latency_steps, round(learning.episode_s * timing.rate_hz),
-        max(1, round(approach.docked_time_s * timing.rate_hz)), timing.ticks_per_image,
+        max(1, round(steady_s * timing.rate_hz)), timing.ticks_per_image,
         len(target_plants), len(solids), len(sensor), TASKS.index(kind),
         learning.observation == "statistical", len(names_of(chasers, kind)),
         step_s, tick_s, scenario.chaser.probe_reach_m, _c([s / 2 for s in scenario.chaser.size_m]),
@@ -222,13 +244,14 @@ def task_of(scenario: Scenario, environments: int) -> TrainingTask:
         docking.final_m,
         _ProbeLimits.of(docking.corridor), _ProbeLimits.of(docking.final),
         _ProbeLimits.of(docking.tolerances),
-        _Weights(*(getattr(learning.reward, field[0]) for field in _Weights._fields_)), surface,
+        _Weights(*(getattr(learning.reward, field[0]) for field in _Weights._fields_)),
+        surface, stack,
         _c(start.position_m), math.radians(start.rotation_deg), start.velocity_m_s,
         math.radians(start.rate_deg_s), math.radians(start.target_rate_deg_s),
         _c(_state13(target)), _c(camera.position_crf_m), _c(camera.q_crf_irf_wxyz),
         _c([left, top, right, bottom]), distances_m[0], distances_m[1] - distances_m[0], *pointers,
     )  # fmt: skip
-    return TrainingTask(scenario, learning, numbers, effort, (places, *arrays, *points))
+    return TrainingTask(scenario, learning, numbers, effort, (places, *arrays, *points, closed))
 
 
 def _padded(count: int) -> int:
@@ -301,16 +324,18 @@ def _place(scenario: Scenario, chaser: int, kind: str) -> _Place:
     )  # fmt: skip
 
 
-def _plants(scenario: Scenario, pulsed: bool, actuators: int) -> tuple[Array, Array]:
+def _plants(
+    scenario: Scenario, pulsed: bool, actuators: int, bodies: _Bodies
+) -> tuple[Array, Array]:
     """Return the bodies that ``[truth]`` gives to the seeds from the scenario's on: chasers
     (P, chasers, 17 + 6 actuators) and target (P, 17). Without ``[truth]`` all are the same.
     """
-    first = _bodies(scenario, pulsed, actuators)
-    second = _bodies(_with_seed(scenario, 1), pulsed, actuators)
+    first = bodies(scenario, pulsed, actuators)
+    second = bodies(_with_seed(scenario, 1), pulsed, actuators)
     if all(np.array_equal(a, b) for a, b in zip(first, second, strict=True)):
         return first[0][None], first[1][None]
     drawn = [first, second]
-    drawn += [_bodies(_with_seed(scenario, k), pulsed, actuators) for k in range(2, PLANTS)]
+    drawn += [bodies(_with_seed(scenario, k), pulsed, actuators) for k in range(2, PLANTS)]
     return np.stack([d[0] for d in drawn]), np.stack([d[1] for d in drawn])
 
 
@@ -323,13 +348,45 @@ def _bodies(scenario: Scenario, pulsed: bool, actuators: int) -> tuple[Array, Ar
     for i, row in enumerate(chasers):
         plant = chaser_plant(scenario, i)
         row[:_BODY_ROWS] = _properties(plant)
-        columns = _thruster_columns(scenario, i) if pulsed else _wrench_columns(scenario, i)
-        row[_BODY_ROWS:] = np.concatenate([plant.wrench_in_engine(c) for c in columns])
+        columns = [plant.wrench_in_engine(c) for c in _columns(scenario, i, pulsed)]
+        row[_BODY_ROWS:] = np.concatenate(columns)
     target = target_plant(scenario)
     properties = _properties(target)
     if scenario.target.motion != "torque_free":
         properties[1:4] = 1.0  # equal moments keep a prescribed rate
     return chasers, properties
+
+
+def _stack_bodies(scenario: Scenario, pulsed: bool, actuators: int) -> tuple[Array, Array]:
+    """Return the chasers as `_bodies`, with wrenches in the frame of the stack, and the stack."""
+    mounts = mounted_chasers(scenario)
+    plants = [chaser_plant(scenario, i) for i in mounts]
+    stack = stack_plant(target_plant(scenario), plants, list(mounts.values()))
+    chasers = np.empty((len(mounts), _BODY_ROWS + 6 * actuators))
+    for row, plant, (i, mount) in zip(chasers, plants, mounts.items(), strict=True):
+        row[:_BODY_ROWS] = _properties(plant)
+        columns = columns_in_stack(stack, mount, _columns(scenario, i, pulsed))
+        row[_BODY_ROWS:] = columns.ravel()
+    return chasers, _properties(stack)
+
+
+_Bodies = Callable[[Scenario, bool, int], tuple[Array, Array]]
+
+
+def _stack(scenario: Scenario, pulsed: bool, kind: str) -> tuple[_Stack, Array | IntArray]:
+    """Return what ``detumble`` judges, and the thrusters that stay closed."""
+    limits = scenario.success.detumbled or scenario.detumble
+    rest = limits.speed_m_s, math.radians(limits.rate_deg_s)
+    if kind != "detumble":
+        return _Stack(*rest, _c(np.zeros(3)), None), np.zeros(1)
+    centre = _c(stated_stack(scenario).centre_trf_m)
+    closed = closed_thrusters(scenario) if pulsed else np.zeros((1, 1), dtype=np.int64)
+    return _Stack(*rest, centre, location(closed) if pulsed else None), closed
+
+
+def _columns(scenario: Scenario, chaser: int, pulsed: bool) -> Array:
+    """Return the wrench (actuators, 6), body axes, of each actuator at level 1."""
+    return _thruster_columns(scenario, chaser) if pulsed else _wrench_columns(scenario, chaser)
 
 
 def _properties(plant: Plant) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from chaserdock_protocol.errors import ChaserdockError, ScenarioError
 from chaserdock_protocol.scenario import Scenario, parse_scenario
-from env_cases import ALONG_PORT, SEVERAL, START, along_port, docking, learning
+from env_cases import ALONG_PORT, SEVERAL, START, along_port, docking, learning, start_of
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 from harness import ROOT
@@ -33,10 +33,10 @@ def several(**changes: Any) -> Scenario:
     return parse_scenario(values, "test")
 
 
-@pytest.mark.parametrize("task", ["dock", "inspect"])
+@pytest.mark.parametrize("task", ["dock", "inspect", "detumble"])
 @pytest.mark.parametrize("actuation", ["ideal", "thrusters"])
 def test_gymnasium_accepts_an_environment(actuation: str, task: str) -> None:
-    scenario = docking(f'chaser.actuation="{actuation}"', task=task, start=START)
+    scenario = docking(f'chaser.actuation="{actuation}"', task=task, start=start_of(task))
     environment = envs.make(scenario, render_mode="rgb_array")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -112,6 +112,7 @@ def test_pettingzoo_accepts_environments_of_one_to_sixteen_chasers() -> None:
             docking(start=START, episode_s=3.0),
             several(),
             several(learning=learning("inspect", episode_s=3.0)),
+            several(learning=learning("detumble", episode_s=3.0)),
             sixteen(),
         ):
             parallel_api_test(envs.parallel_env(scenario), num_cycles=100)

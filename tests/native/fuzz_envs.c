@@ -70,9 +70,14 @@ static Task task_of_any(void) {
               .target_pitch = (n + 3) / 4 * 4, .actuators = actuators, .pulsed = whole(0, 1),
               .steps = steps, .latency_steps = whole(0, steps), .episode_ticks = whole(1, 4),
               .held_ticks = whole(1, 3), .image_ticks = whole(1, 2), .plants = count,
-              .boxes = boxes, .bins = bins, .task = whole(HOLD, INSPECT), .statistical = whole(0, 1)};
-    t.width = 16 + 3 * (m - 1) + (t.task == INSPECT ? SURFACE_ELEMENTS : 0);
+              .boxes = boxes, .bins = bins, .task = whole(HOLD, DETUMBLE), .statistical = whole(0, 1)};
+    t.width = 16 + 3 * (m - 1);
+    if (t.task == INSPECT) t.width += SURFACE_ELEMENTS;
+    if (t.task == DETUMBLE) t.width += STACK_ELEMENTS;
     t.surface = surface(boxes);
+    t.stack = (Stack){.speed_m_s = value(0.0, 0.1), .rate_rad_s = value(0.0, 0.2)};
+    fill(t.stack.centre_m, 3, -0.2, 0.2);
+    if (chance(0.5)) t.stack.closed = wholes(m * actuators, 0, 1);
     t.step_s = value(0.001, 0.01), t.tick_s = value(0.01, 0.1), t.reach_m = value(0.3, 0.5);
     fill(t.half_m, 3, 0.05, 0.2);
     t.keep_target_m = value(0.0, 0.8), t.keep_chasers_m = value(0.0, 0.5);
@@ -151,7 +156,7 @@ static Batch batch_of(const Task *t) {
 static void check(const Task *t, const Batch *b) {
     for (int64_t i = 0; i < t->environments * t->chasers; i++) {
         const int64_t outcome = b->outcome[i], e = i / t->chasers;
-        CHECK(outcome >= FLYING && outcome <= INSPECTED);
+        CHECK(outcome >= FLYING && outcome <= STOPPED);
         CHECK(b->terminated[i] <= 1 && b->truncated[i] <= 1 && b->plant[e] < t->plants);
         CHECK(!b->truncated[i] || outcome == HELD || outcome == TIME_OUT);
         CHECK(!b->terminated[i] || (outcome != FLYING && outcome != TIME_OUT));

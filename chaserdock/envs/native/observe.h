@@ -5,8 +5,8 @@
 
 #include "batch.h"
 
-/* Elements that the task INSPECT adds to an observation. */
-enum { SURFACE_ELEMENTS = 10 };
+/* Elements that the tasks INSPECT and DETUMBLE add to an observation. */
+enum { SURFACE_ELEMENTS = 10, STACK_ELEMENTS = 3 };
 
 /* State of a body: origin and axes of the body. */
 typedef struct {
@@ -209,6 +209,13 @@ static void observe(const Task *t, Batch *b, int64_t chaser, int64_t number, con
         const int64_t e = chaser / t->chasers;
         observe_surface(&t->surface, b->unseen + 4 * t->surface.faces * e, &s, sun, out);
         out += SURFACE_ELEMENTS;
+    }
+    if (t->task == DETUMBLE) {
+        double centre[3], turning[3];
+        q_rotate_inverse(target->q, target->v, centre);
+        cross3(target->w, t->stack.centre_m, turning);
+        for (int i = 0; i < 3; i++) out[i] = (float)(centre[i] + turning[i]);
+        out += STACK_ELEMENTS;
     }
     for (int64_t other = 0; other < t->chasers; other++) {
         if (other == number) continue;

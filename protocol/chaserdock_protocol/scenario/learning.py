@@ -67,13 +67,23 @@ class LearningReward(Section):
     )
     within_per_s: Number = Field(
         default=0.0,
-        description="For each second within `approach.docked_position_m` and `docked_angle_deg`.",
+        description="For each second within `approach.docked_position_m` and `docked_angle_deg`; "
+        "with `detumble` within the limits of rest.",
     )
     time_per_s: Number = Field(default=0.0, description="Lost for each second.")
     seen: Number = Field(
         default=0.0,
         description="`inspect`: for all points of the surface; each chaser gets the share of those "
         "that it is the first to see.",
+    )
+    spin_per_rad_s: Number = Field(
+        default=0.0,
+        description="`detumble`: for each radian/s by which the rate of the stack falls.",
+    )
+    drift_per_m_s: Number = Field(
+        default=0.0,
+        description="`detumble`: for each m/s by which the speed of the stack's centre of mass "
+        "(WRF) falls.",
     )
     success: Number = Field(default=0.0, description="For the task's success.")
     failure: Number = Field(
@@ -117,12 +127,13 @@ class LearningInspection(Section):
 
 class LearningSection(Section):
     """Task and reward of a training environment ([learning.md](learning.md)). Its criteria are
-    those of missions: `approach`, `docking`, `limits`.
+    those of missions: `approach`, `docking`, `limits`, `detumble`.
     """
 
-    task: Literal["hold", "dock", "inspect"] = Field(
+    task: Literal["hold", "dock", "inspect", "detumble"] = Field(
         description="`hold`: stay at the reference pose. `dock`: come to the docking distance or "
-        "into the port, as `docking.kind` says. `inspect`: see the target's surface."
+        "into the port, as `docking.kind` says. `inspect`: see the target's surface. `detumble`: "
+        "latched to the target, stop it."
     )
     observation: Literal["truth", "statistical"] = Field(
         default="truth",
@@ -148,13 +159,39 @@ def check_learning(scenario: Scenario) -> None:
             f"learning.episode_s: {learning.episode_s:g} s is shorter than a tick of "
             f"{1.0 / scenario.time.rate_hz:g} s"
         )
-    if learning.task == "dock" and scenario.docking.kind == "capture":
+    if learning.task == "detumble" or (
+        learning.task == "dock" and scenario.docking.kind == "capture"
+    ):
         portless = [i for i in range(count) if scenario.docking.port_of(i) is None]
         if portless:
             raise ValueError(
                 f"learning.task: chasers {', '.join(map(str, portless))} have no port to dock at"
             )
-    _check_spread(scenario, math.hypot(*learning.start.position_m))
+    if learning.task == "detumble":
+        _check_stack(learning)
+    else:
+        _check_spread(scenario, math.hypot(*learning.start.position_m))
+
+
+def _check_stack(learning: LearningSection) -> None:
+    """Raise ValueError for keys without a meaning for latched chasers."""
+    if learning.observation != "truth":
+        raise ValueError(
+            'learning.observation: "detumble" has "truth" only; latched chasers know their motion '
+            "from odometry, whose errors environments do not have"
+        )
+    start = learning.start
+    spreads = {
+        "position_m": any(start.position_m),
+        "rotation_deg": start.rotation_deg,
+        "velocity_m_s": start.velocity_m_s,
+        "rate_deg_s": start.rate_deg_s,
+    }
+    if found := [key for key, spread in spreads.items() if spread]:
+        raise ValueError(
+            f'learning.start.{found[0]}: must be 0 for "detumble", whose chasers start at their '
+            "ports; target_rate_deg_s spreads the rate"
+        )
 
 
 def _check_spread(scenario: Scenario, reach_m: float) -> None:

@@ -15,19 +15,29 @@ from common import BenchmarkFailed, Figures, Group, Options
 from chaserdock.envs.batch import DockingBatch
 
 _TASK = (
-    'learning={{task="dock", episode_s=30.0, observation="{observation}", '
-    "start={{position_m=[0.1, 0.2, 0.2], rotation_deg=5.0, velocity_m_s=0.02, rate_deg_s=1.0}}}}"
+    'learning={{task="{task}", action="{action}", episode_s=30.0, observation="{observation}", '
+    "start={{{start}}}}}"
 )
+_START = "position_m=[0.1, 0.2, 0.2], rotation_deg=5.0, velocity_m_s=0.02, rate_deg_s=1.0"
 _LEVEL = 0.05
 """Size of random actions, in shares of the limits: with it, most episodes last their 30 s, and the
 camera sees the target.
 """
 _BAR_PER_S = 1e6
+_STEPS, _PLANNED_STEPS = 100_000, 1_000
+"""Steps of a round; with the NMPC, which takes about a millisecond for a step, fewer."""
 
 
-def _scenario(actuation: str, observation: str, sets: list[str]) -> Scenario:
+def _scenario(
+    actuation: str,
+    observation: str,
+    sets: list[str],
+    task: str = "dock",
+    action: str = "actuators",
+) -> Scenario:
+    start = "target_rate_deg_s=1.0" if task == "detumble" else _START
     overrides = (
-        _TASK.format(observation=observation),
+        _TASK.format(task=task, action=action, observation=observation, start=start),
         f'chaser.actuation="{actuation}"',
         'truth.preset="mismatch"',
         *sets,
@@ -35,7 +45,9 @@ def _scenario(actuation: str, observation: str, sets: list[str]) -> Scenario:
     return load_scenario(shipped_scenario("docking-contact"), overrides)
 
 
-def _steps_per_s(scenario: Scenario, environments: int, rounds: int) -> tuple[float, float]:
+def _steps_per_s(
+    scenario: Scenario, environments: int, rounds: int, steps: int = _STEPS
+) -> tuple[float, float]:
     """Return the median number of agent steps in a second of processor time, and the share of steps
     that began an episode.
     """
@@ -44,7 +56,7 @@ def _steps_per_s(scenario: Scenario, environments: int, rounds: int) -> tuple[fl
     rng, started, rates = np.random.default_rng(2), 0, []
     shape = (16, environments, batch.chasers, batch.task.actuators)
     actions = (_LEVEL * rng.standard_normal(shape)).astype(np.float32)
-    ticks = max(16, 100_000 // (environments * batch.chasers))
+    ticks = max(4, steps // (environments * batch.chasers))
     for _ in range(rounds):
         begin_s = time.process_time()
         for tick in range(ticks):
@@ -57,7 +69,8 @@ def _steps_per_s(scenario: Scenario, environments: int, rounds: int) -> tuple[fl
 
 def environments(options: Options) -> Figures:
     """Agent steps in a second of processor time on one core: docking with six degrees of freedom,
-    random actions, observations, rewards and new episodes included (bar with ``ideal``: 1e6).
+    random actions, observations, rewards and new episodes included (bar with ``ideal``: 1e6); and
+    with the other tasks and actions, with ``ideal`` and ``truth``.
     """
     figures, count = Figures(), options.environments
     rounds = 3 if options.quick else 9
@@ -72,6 +85,14 @@ def environments(options: Options) -> Figures:
                 flush=True,
             )
             figures[f"{name}_steps_per_s"] = rate
+    others = (("inspect", "actuators"), ("detumble", "actuators"), ("dock", "reference"))
+    for task, action in others:
+        scenario = _scenario("ideal", "truth", options.set, task, action)
+        steps = _STEPS if action == "actuators" else _PLANNED_STEPS
+        rate, _ = _steps_per_s(scenario, count, rounds, steps)
+        name = task if action == "actuators" else action
+        print(f"{name:21} {count} environments  {rate:10.4g} steps/s", flush=True)
+        figures[f"{name}_steps_per_s"] = rate
     figures["environments"] = count
     figures["physics_steps_per_step"] = scenario.timing.steps_per_tick
     slow = [k for k, v in figures.items() if k.startswith("ideal") and v < _BAR_PER_S]

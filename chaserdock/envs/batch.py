@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from ctypes import byref, c_void_p
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
@@ -21,7 +21,10 @@ from chaserdock_world.plant import PrincipalFrame
 from numpy.typing import NDArray
 
 from .native import LIBRARY, function
-from .task import TrainingTask, task_of
+from .task import TASKS, TrainingTask, task_of
+
+if TYPE_CHECKING:
+    from .reference import ReferenceFlight
 
 Floats = NDArray[np.float32]
 Booleans = NDArray[np.bool_]
@@ -92,6 +95,14 @@ class DockingBatch:
         self._arrays = a
         self._state = _State(*(location(a[field[0]]) for field in _State._fields_))
         self._step, self._start = function("step_batch"), function("start_batch")
+        self._reference: ReferenceFlight | None = None
+        if self.task.learning.action == "reference":
+            # Imported here, as it needs the NMPC, which other actions do not load.
+            from .reference import ReferenceFlight
+
+            self._reference = ReferenceFlight(
+                scenario, self.task.learning.reference, TASKS[t.task], n
+            )
 
     def start(self, seed: int | None = None, chosen: Booleans | None = None) -> Floats:
         """Start all environments, or those ``chosen`` (n,), and return the observations.
@@ -108,6 +119,8 @@ class DockingBatch:
         done = self._arrays["done"]
         waiting = np.zeros_like(done) if chosen is None else done & ~chosen  # for their next step
         done[:] = True if chosen is None else chosen
+        if self._reference is not None:
+            self._reference.restart(done.astype(bool))
         self._start(byref(self.task.numbers), byref(self._state))
         done |= waiting
         return self._arrays["observations"].copy()
@@ -115,14 +128,20 @@ class DockingBatch:
     def step(self, actions: NDArray[np.floating]) -> BatchStep:
         """Fly all environments for a tick with actions (n, m, actuators).
 
-        Wrenches in shares of the limits, -1 to 1 along CRF's axes, or open times of the thrusters
-        in shares of a tick, 0 to 1; values beyond are limited. Raises ValueError for another shape.
+        Wrenches in shares of the limits, -1 to 1 along CRF's axes, open times of the thrusters in
+        shares of a tick, 0 to 1, or offsets of the NMPC's reference (``ReferenceFlight``), -1 to 1;
+        values beyond are limited. Raises ValueError for another shape.
         """
         a, given = self._arrays, np.asarray(actions)
         if given.shape != a["actions"].shape:
             raise ValueError(f"actions: the shape is {given.shape}, not {a['actions'].shape}")
         with np.errstate(over="ignore", invalid="ignore"):
             a["actions"][...] = given
+        if self._reference is not None:
+            flying = a["done"] == 0
+            self._reference.restart(~flying)
+            seen, moved = a["observations"].astype(float), a["actions"].astype(float)
+            a["actions"][...] = self._reference.wrenches(seen, moved, flying)
         self._step(byref(self.task.numbers), byref(self._state))
         n, m = self.environments, self.chasers
         return BatchStep(

@@ -33,6 +33,7 @@ def facts_of(task: TrainingTask) -> dict[str, str]:
     scenario = task.scenario
     return {
         "task": TASKS[task.numbers.task],
+        "action": task.learning.action,
         "observation": json.dumps(names_of(len(scenario.chasers), TASKS[task.numbers.task])),
         "actuation": scenario.chaser.actuation,
         "actuators": str(task.actuators),
@@ -62,6 +63,7 @@ class Policy:
             facts: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
             self.names = tuple(json.loads(facts["observation"]))
             self.task, self.actuation = facts["task"], facts["actuation"]
+            self.action = facts.get("action", "actuators")
             self.actuators, self.rate_hz = int(facts["actuators"]), float(facts["rate_hz"])
             width = self._session.get_inputs()[0].shape[1]
         except Exception as error:  # ONNX Runtime raises classes of its own

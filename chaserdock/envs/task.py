@@ -183,12 +183,12 @@ class TrainingTask:
 
     @property
     def actuators(self) -> int:
-        """Number of actuators of a chaser: six axes of its wrench, or its thrusters."""
+        """Number of actions of a chaser: six axes of its wrench or reference, or its thrusters."""
         return self.numbers.actuators
 
     @property
     def pulsed(self) -> bool:
-        """Whether actions are levels of thrusters, 0 to 1; otherwise of a wrench, -1 to 1."""
+        """Whether actions are levels of thrusters, 0 to 1; otherwise they are -1 to 1."""
         return bool(self.numbers.pulsed)
 
     @property

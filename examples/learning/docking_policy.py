@@ -38,6 +38,11 @@ class PolicySolver:
                 f"{self.policy.path}: is for the task {self.policy.task!r}; this solver flies "
                 f"{', '.join(TASKS)}"
             )
+        if self.policy.action != "actuators":
+            raise PolicyError(
+                f"{self.policy.path}: its actions are of {self.policy.action!r}; this solver takes "
+                "those of actuators"
+            )
         if self.policy.actuation != "ideal":
             raise PolicyError(
                 f"{self.policy.path}: commands {self.policy.actuation!r}; a solver plans wrenches, "

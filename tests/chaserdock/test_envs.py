@@ -34,9 +34,16 @@ def several(**changes: Any) -> Scenario:
 
 
 @pytest.mark.parametrize("task", ["dock", "inspect", "detumble"])
-@pytest.mark.parametrize("actuation", ["ideal", "thrusters"])
-def test_gymnasium_accepts_an_environment(actuation: str, task: str) -> None:
-    scenario = docking(f'chaser.actuation="{actuation}"', task=task, start=start_of(task))
+@pytest.mark.parametrize(
+    ("actuation", "action"),
+    [("ideal", "actuators"), ("thrusters", "actuators"), ("ideal", "reference")],
+)
+def test_gymnasium_accepts_an_environment(actuation: str, action: str, task: str) -> None:
+    if (task, action) == ("detumble", "reference"):
+        pytest.skip("the NMPC flies free chasers")
+    scenario = docking(
+        f'chaser.actuation="{actuation}"', task=task, action=action, start=start_of(task)
+    )
     environment = envs.make(scenario, render_mode="rgb_array")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -113,6 +120,7 @@ def test_pettingzoo_accepts_environments_of_one_to_sixteen_chasers() -> None:
             several(),
             several(learning=learning("inspect", episode_s=3.0)),
             several(learning=learning("detumble", episode_s=3.0)),
+            several(learning=learning(action="reference", episode_s=3.0)),
             sixteen(),
         ):
             parallel_api_test(envs.parallel_env(scenario), num_cycles=100)

@@ -125,6 +125,15 @@ class LearningInspection(Section):
     )
 
 
+class LearningReference(Section):
+    """Largest offsets of the NMPC's reference by the action `reference`."""
+
+    position_m: Positive = Field(default=0.5, description="Along each axis (TRF), m.")
+    rotation_deg: HalfTurn = Field(
+        default=20.0, description="Of the rotation vector along each axis (CRF), degrees."
+    )
+
+
 class LearningSection(Section):
     """Task and reward of a training environment ([learning.md](learning.md)). Its criteria are
     those of missions: `approach`, `docking`, `limits`, `detumble`.
@@ -135,6 +144,11 @@ class LearningSection(Section):
         "into the port, as `docking.kind` says. `inspect`: see the target's surface. `detumble`: "
         "latched to the target, stop it."
     )
+    action: Literal["actuators", "reference"] = Field(
+        default="actuators",
+        description="`actuators`: those of `chaser.actuation`. `reference`: offsets of the "
+        "reference that the NMPC follows.",
+    )
     observation: Literal["truth", "statistical"] = Field(
         default="truth",
         description="`truth`, or `statistical`: with the errors that a filter of the statistical "
@@ -144,6 +158,7 @@ class LearningSection(Section):
     start: LearningStart = LearningStart()
     reward: LearningReward = LearningReward()
     inspect: LearningInspection = LearningInspection()
+    reference: LearningReference = LearningReference()
 
 
 def check_learning(scenario: Scenario) -> None:
@@ -167,10 +182,20 @@ def check_learning(scenario: Scenario) -> None:
             raise ValueError(
                 f"learning.task: chasers {', '.join(map(str, portless))} have no port to dock at"
             )
+    if learning.action == "reference":
+        _check_reference(scenario, learning)
     if learning.task == "detumble":
         _check_stack(learning)
     else:
         _check_spread(scenario, math.hypot(*learning.start.position_m))
+
+
+def _check_reference(scenario: Scenario, learning: LearningSection) -> None:
+    """Raise ValueError if the NMPC cannot fly the chasers."""
+    if learning.task == "detumble":
+        raise ValueError('learning.action: "reference" is for free chasers, not for "detumble"')
+    if scenario.chaser.actuation != "ideal":
+        raise ValueError('learning.action: "reference" needs chaser.actuation = "ideal"')
 
 
 def _check_stack(learning: LearningSection) -> None:

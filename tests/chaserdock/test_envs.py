@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import subprocess
 import sys
@@ -297,7 +298,26 @@ def test_the_proportional_law_of_the_example_docks() -> None:
     assert counts["docked"] >= 196
 
 
-@pytest.mark.parametrize("name", ["docking", "holding", "inspecting"])
+@pytest.mark.slow
+def test_the_team_of_the_example_docks_without_coming_near_each_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The ways of two chasers cross: without evasion they come too near."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    for name in ("team", "proportional"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    team = importlib.import_module("team")
+    environment = envs.parallel_env(team.SCENARIO)
+    limit_m = envs.loaded(team.SCENARIO).limits.min_distance_chasers_m
+    episode = team.fly(environment, 3)
+    assert set(episode.outcomes.values()) == {"docked"}
+    assert episode.nearest_m > limit_m
+    monkeypatch.setattr(team, "AWAY_PER_S", 0.0)
+    episode = team.fly(environment, 3)
+    assert "too near" in episode.outcomes.values()
+
+
+@pytest.mark.parametrize("name", ["docking", "holding", "inspecting", "team"])
 def test_tasks_of_the_examples_have_rewards(name: str) -> None:
     environment = envs.parallel_env(EXAMPLES / f"{name}.toml")
     environment.reset(seed=1)

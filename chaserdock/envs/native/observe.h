@@ -120,7 +120,7 @@ static void advance_errors(const Task *t, Batch *b, int64_t e, int64_t chaser, c
 
 /* Turn a relative state into the observed one by the errors of the target's pose as seen from the
  * chaser: the target is displaced by e in CRF, and turned by d in TRF, and with it the direction to the
- * sun. */
+ * sun, unless that is null. */
 static void disturb(const Task *t, const Batch *b, int64_t chaser, Relative *s, double *target_rate,
                     double *sun) {
     double e[ERROR_ROWS], shift[3], drift[3], turn[4], back[4], q[4], turning[3], rate[3];
@@ -133,7 +133,7 @@ static void disturb(const Task *t, const Batch *b, int64_t chaser, Relative *s, 
     q_conjugate(turn, back);
     q_rotate(back, s->r, s->r);
     q_rotate(back, s->v, s->v);
-    q_rotate(back, sun, sun);
+    if (sun) q_rotate(back, sun, sun);
     cross3(e + 9, s->r, turning);
     subtract3(s->v, turning, s->v);
     q_multiply(back, s->q, q);
@@ -195,7 +195,7 @@ static void observe(const Task *t, Batch *b, int64_t chaser, int64_t number, con
     double rate[3], error[4], sun[3] = {0.0, 0.0, 0.0};
     copy(target->w, rate, 3);
     if (t->task == INSPECT) q_rotate_inverse(target->q, t->surface.to_sun, sun);
-    if (t->statistical) disturb(t, b, chaser, &s, rate, sun);
+    if (t->statistical) disturb(t, b, chaser, &s, rate, t->task == INSPECT ? sun : NULL);
     attitude_error(t->places + number, s.q, error);
     for (int i = 0; i < 3; i++) {
         out[i] = (float)(s.r[i] - t->places[number].goal_m[i]);

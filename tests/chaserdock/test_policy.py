@@ -243,7 +243,7 @@ def test_the_solver_flies_rows_that_dock_by_the_policy_and_others_by_the_nmpc(
     assert alone.status == ("solved",) * 3
 
 
-def test_a_policy_of_thrusters_is_no_solver(
+def test_a_policy_of_thrusters_of_another_task_or_of_references_is_no_solver(
     example: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written(example, tmp_path / "p.onnx", docking())
@@ -253,6 +253,10 @@ def test_a_policy_of_thrusters_is_no_solver(
     written(example, tmp_path / "p.onnx", inspecting)
     with pytest.raises(PolicyError, match=r"task 'inspect'; this solver flies hold, come, latch"):
         solver_for(example, tmp_path / "p.onnx", inspecting, monkeypatch)
+    ideal = docking('chaser.actuation="ideal"', action="reference")
+    written(example, tmp_path / "p.onnx", ideal)
+    with pytest.raises(PolicyError, match=r"its actions are of 'reference'; this solver takes"):
+        solver_for(example, tmp_path / "p.onnx", ideal, monkeypatch)
 
 
 def test_a_solver_is_prepared_before_the_flight_and_its_errors_are_named() -> None:

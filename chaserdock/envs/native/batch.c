@@ -35,7 +35,8 @@ static void add_pulses(const Task *t, const Batch *b, int64_t chaser, int64_t fr
 }
 
 /* Convert levels (actuators) to pulses of whole steps, none below the shortest, and none of a closed
- * thruster; a pulse that would end during the fall before the next tick lasts until it. Returns the impulse, N s. */
+ * thruster; a pulse that would end during the fall before the next tick lasts until it. Returns the
+ * impulse, N s. */
 static double set_pulses(const Task *t, Batch *b, int64_t chaser, const float *levels, int valid) {
     const int64_t number = chaser % t->chasers, *closed = t->stack.closed;
     double impulse = 0.0;

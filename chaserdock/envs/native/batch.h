@@ -9,8 +9,8 @@
 #include "random.h"
 
 /* Tasks: keep a place relative to the target; come to it; be latched by the port; see the target's
- * surface; latched to the target, stop it. With DETUMBLE `targets` are the stacks of a target and all
- * chasers, and so are `target_plants`; `chaser_plants` have wrenches in the stack's principal frame. */
+ * surface; latched to the target, stop it. With DETUMBLE `targets` and `target_plants` are stacks of
+ * a target and all chasers, and the wrenches of `chaser_plants` are in the stack's principal frame. */
 enum { HOLD, COME, LATCH, INSPECT, DETUMBLE };
 
 /* How a chaser's episode stands or ended. DOCKED, HELD, INSPECTED and STOPPED are successes. In
@@ -110,12 +110,12 @@ LAYOUT(Task, environments, chasers, pitch, target_pitch, actuators, pulsed, step
        episode_ticks, held_ticks, image_ticks, plants, boxes, bins, task, statistical, width, step_s,
        tick_s, reach_m, half_m, keep_target_m, keep_chasers_m, farthest_m, fastest_rad_s, held_m,
        held_rad, entry_m, final_m, corridor, final, contact, weights, surface, stack, spread_m,
-       spread_rad, spread_m_s, spread_rad_s, target_spread_rad_s, target_start, camera_m, camera_wxyz, view,
-       bin_first_m, bin_m, places, chaser_plants, target_plants, solids, rise, fall, effort_N_s,
-       sensor, rise_steps, fall_steps, shortest, longest)
+       spread_rad, spread_m_s, spread_rad_s, target_spread_rad_s, target_start, camera_m,
+       camera_wxyz, view, bin_first_m, bin_m, places, chaser_plants, target_plants, solids, rise,
+       fall, effort_N_s, sensor, rise_steps, fall_steps, shortest, longest)
 
-/* Rows of `memory`, of the last tick: distance and angle from the goal, or speed and rate of a stack; the probe at its port; ticks
- * within the tolerances. */
+/* Rows of `memory`, of the last tick: distance and angle from the goal, or speed and rate of a stack;
+ * the probe at its port; ticks within the tolerances. */
 enum { AWAY, TURNED, GAP, LATERAL, LATERAL_SPEED, CLOSING, TURNING, WITHIN, MEMORY_ROWS };
 
 /* Rows of `docked`: place of a docked chaser's frame in TRF, position and attitude. */
@@ -141,8 +141,8 @@ typedef struct {
     uint8_t *seen, *terminated, *truncated;
     int64_t *rejected, *idle;
 } Batch;
-LAYOUT(Batch, bodies, targets, wrench, memory, docked, errors, unseen, work, pulse, opened, age, plant,
-       done, outcome, random, actions, observations, rewards, seen, terminated, truncated, rejected,
-       idle)
+LAYOUT(Batch, bodies, targets, wrench, memory, docked, errors, unseen, work, pulse, opened, age,
+       plant, done, outcome, random, actions, observations, rewards, seen, terminated, truncated,
+       rejected, idle)
 
 #endif

@@ -69,7 +69,8 @@ static void start(const Task *t, Batch *b, int64_t e) {
         remember(t, b, chaser, &now);
         b->memory[WITHIN * pitch + chaser] = 0.0;
         if (t->task == DETUMBLE)
-            stack_rates(t, b, e, b->memory + AWAY * pitch + chaser, b->memory + TURNED * pitch + chaser);
+            stack_rates(t, b, e, b->memory + AWAY * pitch + chaser,
+                        b->memory + TURNED * pitch + chaser);
         if (t->statistical) draw_errors(t, b, e, chaser, states + number);
         observe(t, b, chaser, number, states + number, &target, others);
         b->rewards[chaser] = 0.0, b->outcome[chaser] = FLYING;

@@ -6,6 +6,9 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import ActuatorCommand, ThrusterPulse
 from chaserdock_protocol.scenario import Scenario, load_scenario, parse_scenario
 from chaserdock_protocol.shipped_scenarios import shipped_scenario
 
@@ -30,6 +33,12 @@ START = {
     "target_rate_deg_s": 1.0,
 }
 """Spread of the start."""
+
+
+def start_of(task: str) -> dict[str, Any]:
+    """The spread of the start that a task may have."""
+    rate = {"target_rate_deg_s": START["target_rate_deg_s"]}
+    return rate if task == "detumble" else START
 
 
 def learning(task: str = "dock", **keys: Any) -> dict[str, Any]:
@@ -92,3 +101,42 @@ SEVERAL: dict[str, Any] = ALONG_PORT | {
     "learning": learning(),
 }  # fmt: skip
 """Three chasers with a port each; the first drifts into its own."""
+
+
+def actuator_command(
+    scenario: Scenario, tick: int, action: Array, chaser: int = 0
+) -> ActuatorCommand:
+    """The command of the world's actuators for an action (actuators,)."""
+    timing, body = scenario.timing, scenario.chaser
+    at = timing.step_of_tick(tick) + timing.latency_steps
+    given: dict[str, Any] = {"force_N": (0.0,) * 3, "torque_N_m": (0.0,) * 3, "pulses": ()}
+    if body.actuation == "ideal":
+        wrench = (np.clip(action, -1.0, 1.0) * body.wrench_max).tolist()
+        given |= {"force_N": tuple(wrench[:3]), "torque_N_m": tuple(wrench[3:])}
+    else:
+        pulses = []
+        for k, (thruster, level) in enumerate(
+            zip(body.thrusters, np.clip(action, 0.0, 1.0).tolist(), strict=True)
+        ):
+            steps = int(level * timing.steps_per_tick + 0.5)
+            off_s = (timing.steps_per_tick - steps) / timing.physics_hz
+            if off_s <= thruster.fall_s + 1e-9:
+                steps = timing.steps_per_tick
+            if steps / timing.physics_hz >= thruster.min_on_s - 1e-9:
+                pulses.append(
+                    ThrusterPulse(
+                        thruster=k,
+                        open_ns=timing.time_ns(at),
+                        close_ns=timing.time_ns(at + steps),
+                    )
+                )
+        given["pulses"] = tuple(pulses)
+    return ActuatorCommand(
+        chaser=chaser,
+        tick=tick,
+        seq=tick,
+        sim_time_ns=timing.tick_time_ns(tick),
+        effective_time_ns=timing.time_ns(at),
+        source="command",
+        **given,
+    )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from ctypes import byref, c_void_p
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
@@ -22,7 +22,10 @@ from numpy.typing import NDArray
 
 from .images import BatchImages
 from .native import LIBRARY, function
-from .task import TrainingTask, task_of
+from .task import TASKS, TrainingTask, task_of
+
+if TYPE_CHECKING:
+    from .reference import ReferenceFlight
 
 Floats = NDArray[np.float32]
 Booleans = NDArray[np.bool_]
@@ -37,9 +40,9 @@ class _State(ctypes.Structure):
     _fields_ = [
         (name, c_void_p)
         for name in (
-            "bodies", "targets", "wrench", "memory", "docked", "errors", "work", "pulse", "opened",
-            "age", "plant", "done", "outcome", "random", "actions", "observations", "rewards",
-            "terminated", "truncated", "rejected", "idle",
+            "bodies", "targets", "wrench", "memory", "docked", "errors", "unseen", "work", "pulse",
+            "opened", "age", "plant", "done", "outcome", "random", "actions", "observations",
+            "rewards", "seen", "terminated", "truncated", "rejected", "idle",
         )
     ]  # fmt: skip
 
@@ -83,6 +86,8 @@ class DockingBatch:
         a["targets"] = np.zeros((30, t.target_pitch))
         for body in (a["bodies"], a["targets"]):
             body[[6, 13, 14, 15, 16, 23]] = 1.0  # bodies that fill up the last four
+        a["unseen"] = np.zeros((n, t.surface.faces, 4))
+        a["seen"] = np.zeros((n, t.surface.points), np.uint8)
         a["work"] = np.zeros(24 * t.steps)
         a["outcome"] = np.zeros((n, m), np.int64)
         a["random"] = np.zeros(n, np.uint64)
@@ -95,6 +100,14 @@ class DockingBatch:
         self._step, self._start = function("step_batch"), function("start_batch")
         images = self.task.learning.observation == "images"
         self._images = BatchImages(scenario, environments) if images else None
+        self._reference: ReferenceFlight | None = None
+        if self.task.learning.action == "reference":
+            # Imported here, as it needs the NMPC, which other actions do not load.
+            from .reference import ReferenceFlight
+
+            self._reference = ReferenceFlight(
+                scenario, self.task.learning.reference, TASKS[t.task], n
+            )
 
     def start(self, seed: int | None = None, chosen: Booleans | None = None) -> ObservationArray:
         """Start all environments, or those ``chosen`` (n,), and return the observations.
@@ -111,6 +124,8 @@ class DockingBatch:
         done = self._arrays["done"]
         waiting = np.zeros_like(done) if chosen is None else done & ~chosen  # for their next step
         done[:] = True if chosen is None else chosen
+        if self._reference is not None:
+            self._reference.restart(done.astype(bool))
         self._start(byref(self.task.numbers), byref(self._state))
         done |= waiting
         return self._observations()
@@ -118,14 +133,20 @@ class DockingBatch:
     def step(self, actions: NDArray[np.floating]) -> BatchStep:
         """Fly all environments for a tick with actions (n, m, actuators).
 
-        Wrenches in shares of the limits, -1 to 1 along CRF's axes, or open times of the thrusters
-        in shares of a tick, 0 to 1; values beyond are limited. Raises ValueError for another shape.
+        Wrenches in shares of the limits, -1 to 1 along CRF's axes, open times of the thrusters in
+        shares of a tick, 0 to 1, or offsets of the NMPC's reference (``ReferenceFlight``), -1 to 1;
+        values beyond are limited. Raises ValueError for another shape.
         """
         a, given = self._arrays, np.asarray(actions)
         if given.shape != a["actions"].shape:
             raise ValueError(f"actions: the shape is {given.shape}, not {a['actions'].shape}")
         with np.errstate(over="ignore", invalid="ignore"):
             a["actions"][...] = given
+        if self._reference is not None:
+            flying = a["done"] == 0
+            self._reference.restart(~flying)
+            seen, moved = a["observations"].astype(float), a["actions"].astype(float)
+            a["actions"][...] = self._reference.wrenches(seen, moved, flying)
         self._step(byref(self.task.numbers), byref(self._state))
         n, m = self.environments, self.chasers
         return BatchStep(
@@ -136,6 +157,13 @@ class DockingBatch:
             a["outcome"].copy(),
             a["rejected"].copy(),
         )
+
+    @property
+    def seen(self) -> Booleans:
+        """Which points (n, points) of the target's surface were seen in the episode, in the order
+        of ``surface_of``; without a meaning for other tasks than ``inspect``.
+        """
+        return self._arrays["seen"].astype(bool)
 
     @property
     def plants(self) -> IntArray:

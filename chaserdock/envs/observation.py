@@ -16,6 +16,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.scenario import FlightScenario, Scenario
+from numpy.typing import ArrayLike
 
 NAMES = (
     *(f"position_{k}_m" for k in "xyz"),
@@ -24,13 +25,27 @@ NAMES = (
     *(f"rate_{k}_rad_s" for k in "xyz"),
     *(f"target_rate_{k}_rad_s" for k in "xyz"),
 )
-"""Elements of an observation without other chasers, in order."""
+"""First elements of an observation, in order."""
 
 
-def names_of(chasers: int) -> tuple[str, ...]:
-    """Return the names of the elements of an observation with this number of chasers."""
+ADDED = {
+    "inspect": (
+        *(f"unseen_{k}_m" for k in "xyz"),
+        *(f"unseen_normal_{k}" for k in "xyz"),
+        "seen_share",
+        *(f"sun_{k}" for k in "xyz"),
+    ),
+    "detumble": tuple(f"stack_velocity_{k}_m_s" for k in "xyz"),
+}
+"""Elements that a task of ``TASKS`` (task.py) adds."""
+
+
+def names_of(chasers: int, task: str) -> tuple[str, ...]:
+    """Return the names of the elements of an observation with this number of chasers in a task of
+    ``TASKS`` (task.py).
+    """
     others = (f"other_{i}_{k}_m" for i in range(1, chasers) for k in "xyz")
-    return (*NAMES, *others)
+    return (*NAMES, *ADDED.get(task, ()), *others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +57,13 @@ class Goal:
 
 
 def goal_of(scenario: Scenario | FlightScenario, chaser: int, task: str) -> Goal:
-    """Return the goal of a chaser in a task of ``TASKS`` (task.py)."""
+    """Return the goal of a chaser in a task of ``TASKS`` (task.py); with ``inspect`` it is TRF."""
+    if task == "inspect":
+        return Goal(np.zeros(3), rotations.IDENTITY)
     nominal = np.asarray(scenario.chasers[chaser].position_m, dtype=float)
     attitude = np.asarray(scenario.chasers[chaser].q_wxyz, dtype=float)
     port = scenario.docking.port_of(chaser)
-    if task == "latch" and port is not None:
+    if task in ("latch", "detumble") and port is not None:
         return Goal(centre_offset(port, scenario.chaser.probe_reach_m, 0.0), attitude)
     if task == "hold":
         return Goal(nominal, attitude)
@@ -54,12 +71,25 @@ def goal_of(scenario: Scenario | FlightScenario, chaser: int, task: str) -> Goal
     return Goal(towards * scenario.approach.dock_distance_m, attitude)
 
 
-def observation_of(
-    goal: Goal, chaser: BodyState, target: BodyState, others_m: Sequence[Array] = ()
-) -> Array:
-    """Return the observation (16 + 3 n,) of a chaser: see docs/learning.md.
+def stack_elements(centre_m: Array, target: BodyState) -> Array:
+    """Return what ``detumble`` adds to an observation: velocity (3,) of the stack's centre of mass,
+    TRF axes, m/s. ``centre_m`` (3,): TRF, as ``stated_stack`` (stack.py) has it.
+    """
+    turning = rotations.cross(target.omega_rad_s, centre_m)
+    return rotations.rotate_inverse(target.q_wxyz, target.velocity_m_s) + turning
 
-    ``others_m``: positions (3,), WRF, of the other chasers, by number.
+
+def observation_of(
+    goal: Goal,
+    chaser: BodyState,
+    target: BodyState,
+    others_m: Sequence[Array] = (),
+    added: ArrayLike = (),
+) -> Array:
+    """Return the observation (16 + k + 3 n,) of a chaser: see docs/learning.md.
+
+    ``others_m``: positions (3,), WRF, of the other chasers, by number. ``added`` (k,): what the
+    task adds: ``Coverage.elements`` (surface.py), ``stack_elements``.
     """
     into_target = rotations.conjugate(target.q_wxyz)
     position = rotations.rotate(into_target, chaser.position_m - target.position_m)
@@ -72,5 +102,5 @@ def observation_of(
         error = -error
     others = [rotations.rotate(into_target, at - chaser.position_m) for at in others_m]
     return np.concatenate(
-        [position - goal.position_m, velocity, error, rate, target.omega_rad_s, *others]
+        [position - goal.position_m, velocity, error, rate, target.omega_rad_s, added, *others]
     )

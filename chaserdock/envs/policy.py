@@ -41,7 +41,8 @@ def facts_of(task: TrainingTask) -> dict[str, str]:
         )
     return {
         "task": TASKS[task.numbers.task],
-        "observation": json.dumps(names_of(len(scenario.chasers))),
+        "action": task.learning.action,
+        "observation": json.dumps(names_of(len(scenario.chasers), TASKS[task.numbers.task])),
         "actuation": scenario.chaser.actuation,
         "actuators": str(task.actuators),
         "rate_hz": str(float(scenario.time.rate_hz)),
@@ -70,6 +71,7 @@ class Policy:
             facts: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
             self.names = tuple(json.loads(facts["observation"]))
             self.task, self.actuation = facts["task"], facts["actuation"]
+            self.action = facts.get("action", "actuators")
             self.actuators, self.rate_hz = int(facts["actuators"]), float(facts["rate_hz"])
             width = self._session.get_inputs()[0].shape[1]
         except Exception as error:  # ONNX Runtime raises classes of its own
@@ -83,7 +85,7 @@ class Policy:
 
     def check(self, scenario: Scenario | FlightScenario) -> None:
         """Raise PolicyError if the policy is not for the chasers of a scenario."""
-        needed = names_of(len(scenario.chasers))
+        needed = names_of(len(scenario.chasers), self.task)
         if self.names != needed:
             where = next(
                 (k for k, pair in enumerate(zip(self.names, needed, strict=False))

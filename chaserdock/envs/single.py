@@ -21,7 +21,7 @@ _METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES)}
 class DockingEnv(gymnasium.Env[ObservationArray, Floats]):
     """See ``chaserdock.envs.make``.
 
-    ``info["outcome"]``: one of ``OUTCOMES``; ``info["is_success"]``: docked, or held to the end.
+    ``info["outcome"]``: one of ``OUTCOMES``; ``info["is_success"]``: whether it is a success.
     """
 
     metadata = _METADATA

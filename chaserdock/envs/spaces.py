@@ -27,8 +27,8 @@ def observation_space(task: TrainingTask) -> Space[ObservationArray]:
 
 
 def action_space(task: TrainingTask) -> Space[Floats]:
-    """Return the space of an action (actuators,): shares of the limits of a wrench, -1 to 1, or
-    open times of thrusters in shares of a tick, 0 to 1.
+    """Return the space of an action (actuators,): shares of the limits of a wrench or of the
+    offsets of a reference, -1 to 1, or open times of thrusters in shares of a tick, 0 to 1.
     """
     box: Any = Box(0.0 if task.pulsed else -1.0, 1.0, (task.actuators,), np.float32)
     return box

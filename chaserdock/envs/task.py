@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable
 from ctypes import c_double, c_int64, c_void_p
 from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_controller.guidance.approach_cone import cone_of
+from chaserdock_controller.guidance.parameters import GUIDANCE
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.native import location
@@ -33,21 +35,33 @@ from ..analysis.criteria import nearest_allowed_m
 from .native import LIBRARY
 from .observation import goal_of, names_of
 from .sensor_errors import BINS, sensor_table
+from .stack import (
+    closed_thrusters,
+    columns_in_stack,
+    mounted_chasers,
+    stack_plant,
+    stated_stack,
+)
+from .surface import Surface, extent_m, surface_of
 
 PLANTS = 256
 """Bodies that are drawn from ``[truth]``; each episode flies one of them. The mean of a figure over
 256 draws is within 6 % of its standard deviation.
 """
+MOST_POINTS = 4096
+"""Largest number of points of a surface: a look at all of them takes 0.1 ms."""
 FASTEST_TURN_RAD = 0.2
 """Largest turn in a physics step: up to it the kernel's series are exact to rounding. A chaser that
 turns faster is lost.
 """
-TASKS = ("hold", "come", "latch")
+TASKS = ("hold", "come", "latch", "inspect", "detumble")
+"""Names of the tasks of native/batch.h, in its order."""
 OUTCOMES = (
     "flying", "docked", "held", "time out", "collision", "too near", "lost", "after others",
+    "inspected", "stopped",
 )  # fmt: skip
 """Names of the outcomes of native/batch.h, in its order."""
-SUCCESSES = (1, 2)
+SUCCESSES = (1, 2, 8, 9)
 """Indices of the outcomes that are successes."""
 _BODY_ROWS = 17  # mass to centre of mass
 
@@ -93,9 +107,30 @@ class _Weights(ctypes.Structure):
         "corridor_per_s",
         "within_per_s",
         "time_per_s",
+        "seen",
+        "spin_per_rad_s",
+        "drift_per_m_s",
         "success",
         "failure",
     )
+
+
+@LIBRARY.structure("Surface")
+class _Surface(ctypes.Structure):
+    """Mirror `Surface` of native/batch.h."""
+
+    _fields_ = [
+        *((name, c_int64) for name in ("faces", "points", "needed", "sunlit")),
+        *_doubles("range_m", "least_cosine", "extent_m", to_sun=3),
+        *((name, c_void_p) for name in ("planes", "points_m", "totals", "first", "box")),
+    ]
+
+
+@LIBRARY.structure("Stack")
+class _Stack(ctypes.Structure):
+    """Mirror `Stack` of native/batch.h."""
+
+    _fields_ = [*_doubles("speed_m_s", "rate_rad_s", centre_m=3), ("closed", c_void_p)]
 
 
 @LIBRARY.structure("Task")
@@ -118,6 +153,8 @@ class TaskNumbers(ctypes.Structure):
         ),
         *((name, _ProbeLimits) for name in ("corridor", "final", "contact")),
         ("weights", _Weights),
+        ("surface", _Surface),
+        ("stack", _Stack),
         *_doubles(spread_m=3),
         *_doubles("spread_rad", "spread_m_s", "spread_rad_s", "target_spread_rad_s"),
         *_doubles(target_start=13, camera_m=3, camera_wxyz=4, view=4),
@@ -146,12 +183,12 @@ class TrainingTask:
 
     @property
     def actuators(self) -> int:
-        """Number of actuators of a chaser: six axes of its wrench, or its thrusters."""
+        """Number of actions of a chaser: six axes of its wrench or reference, or its thrusters."""
         return self.numbers.actuators
 
     @property
     def pulsed(self) -> bool:
-        """Whether actions are levels of thrusters, 0 to 1; otherwise of a wrench, -1 to 1."""
+        """Whether actions are levels of thrusters, 0 to 1; otherwise they are -1 to 1."""
         return bool(self.numbers.pulsed)
 
     @property
@@ -171,30 +208,35 @@ def task_of(scenario: Scenario, environments: int) -> TrainingTask:
         raise ScenarioError(
             f"{scenario.name}: no table [learning], which an environment needs (docs/learning.md)"
         )
-    _check_supported(scenario)
+    _check_supported(scenario, learning)
     chasers, timing = len(scenario.chasers), scenario.timing
     count = environments * chasers
     pulsed = scenario.chaser.actuation == "thrusters"
-    kind = TASKS[0] if learning.task == "hold" else TASKS[1 + (scenario.docking.kind == "capture")]
+    docks = "latch" if scenario.docking.kind == "capture" else "come"
+    kind = docks if learning.task == "dock" else learning.task
     actuators = len(scenario.chaser.thrusters) if pulsed else 6
     step_s, tick_s = 1.0 / timing.physics_hz, 1.0 / timing.rate_hz
     places = (_Place * chasers)(*(_place(scenario, i, kind) for i in range(chasers)))
-    chaser_plants, target_plants = _plants(scenario, pulsed, actuators)
+    bodies = _stack_bodies if kind == "detumble" else _bodies
+    chaser_plants, target_plants = _plants(scenario, pulsed, actuators, bodies)
     solids = _solids(scenario)
     valves = _valve_tables(scenario) if pulsed else _NO_VALVES
     effort = _effort_N_s(scenario, pulsed, tick_s)
     start, approach, docking = learning.start, scenario.approach, scenario.docking
     target, camera = prescribed_state(scenario, 0.0), scenario.camera_model()
     left, top, right, bottom = (math.tan(a) for a in camera.angles_to_borders())
-    distances_m, sensor = _sensor(scenario, places)
+    distances_m, sensor = _sensor(scenario, kind)
+    surface, points = _surface(scenario, learning, kind)
+    stack, closed = _stack(scenario, pulsed, kind)
+    steady_s = GUIDANCE.stack_rest_s if kind == "detumble" else approach.docked_time_s
     arrays = (chaser_plants, target_plants, solids, *valves[:2], effort, sensor, *valves[2:])
     pointers = [ctypes.addressof(places), *map(location, arrays)]
     numbers = TaskNumbers(
         environments, chasers, _padded(count), _padded(environments), actuators, pulsed,
         timing.steps_per_tick, timing.latency_steps, round(learning.episode_s * timing.rate_hz),
-        max(1, round(approach.docked_time_s * timing.rate_hz)), timing.ticks_per_image,
+        max(1, round(steady_s * timing.rate_hz)), timing.ticks_per_image,
         len(target_plants), len(solids), len(sensor), TASKS.index(kind),
-        learning.observation == "statistical", len(names_of(chasers)),
+        learning.observation == "statistical", len(names_of(chasers, kind)),
         step_s, tick_s, scenario.chaser.probe_reach_m, _c([s / 2 for s in scenario.chaser.size_m]),
         scenario.limits.min_distance_target_m, scenario.limits.min_distance_chasers_m,
         scenario.limits.max_reference_distance_m, FASTEST_TURN_RAD / step_s,
@@ -203,12 +245,13 @@ def task_of(scenario: Scenario, environments: int) -> TrainingTask:
         _ProbeLimits.of(docking.corridor), _ProbeLimits.of(docking.final),
         _ProbeLimits.of(docking.tolerances),
         _Weights(*(getattr(learning.reward, field[0]) for field in _Weights._fields_)),
+        surface, stack,
         _c(start.position_m), math.radians(start.rotation_deg), start.velocity_m_s,
         math.radians(start.rate_deg_s), math.radians(start.target_rate_deg_s),
         _c(_state13(target)), _c(camera.position_crf_m), _c(camera.q_crf_irf_wxyz),
         _c([left, top, right, bottom]), distances_m[0], distances_m[1] - distances_m[0], *pointers,
     )  # fmt: skip
-    return TrainingTask(scenario, learning, numbers, effort, (places, *arrays))
+    return TrainingTask(scenario, learning, numbers, effort, (places, *arrays, *points, closed))
 
 
 def _padded(count: int) -> int:
@@ -225,13 +268,14 @@ def _state13(s: BodyState) -> Array:
     return np.concatenate([s.position_m, s.velocity_m_s, s.q_wxyz, s.omega_rad_s])
 
 
-def _check_supported(scenario: Scenario) -> None:
+def _check_supported(scenario: Scenario, learning: LearningSection) -> None:
     """Raise ScenarioError for what a mission has and the environments have not."""
     chaser, truth, timing = scenario.chaser, scenario.truth, scenario.timing
     mismatch = truth.mismatch("chaser")
     reasons = {
         "orbit": scenario.orbit is not None,
         "plume": scenario.plume is not None,
+        "camera.eclipses": learning.task == "inspect" and bool(scenario.camera.eclipses),
         "chaser.degrees_of_freedom: planar": chaser.is_planar,
         "time.latency_s longer than a tick": timing.latency_steps > timing.steps_per_tick,
         "thruster_failure": bool(scenario.thruster_failure),
@@ -263,32 +307,35 @@ def _place(scenario: Scenario, chaser: int, kind: str) -> _Place:
     port = scenario.docking.port_of(chaser)
     nominal = np.asarray(stated.position_m)
     axis = nominal / np.linalg.norm(nominal)
-    goal = goal_of(scenario, chaser, kind).position_m
+    goal = goal_of(scenario, chaser, kind)
     cone = (axis, 0.0, 0.0, 1.0)
     nearest_m = limit_m
-    if kind != "hold":
+    if kind in ("come", "latch"):
         found = cone_of(scenario, chaser)
         angle = found.half_angle_rad
         cone = (found.axis, math.sin(angle), math.cos(angle), found.apex_m)
         nearest_m = nearest_allowed_m(scenario, chaser)
-    port_m, port_axis = (goal, axis) if port is None else (port.position_m, port.axis)
+    port_m, port_axis = (goal.position_m, axis) if port is None else (port.position_m, port.axis)
     position, attitude = scenario.start_pose(chaser)
     return _Place(
-        _c(goal), _c(stated.q_wxyz), _c(port_m), _c(port_axis), _c(cone[0]), *cone[1:], nearest_m,
+        _c(goal.position_m), _c(goal.q_wxyz), _c(port_m), _c(port_axis), _c(cone[0]), *cone[1:],
+        nearest_m,
         _c(position), _c(attitude), _c(stated.start_velocity_m_s),
     )  # fmt: skip
 
 
-def _plants(scenario: Scenario, pulsed: bool, actuators: int) -> tuple[Array, Array]:
+def _plants(
+    scenario: Scenario, pulsed: bool, actuators: int, bodies: _Bodies
+) -> tuple[Array, Array]:
     """Return the bodies that ``[truth]`` gives to the seeds from the scenario's on: chasers
     (P, chasers, 17 + 6 actuators) and target (P, 17). Without ``[truth]`` all are the same.
     """
-    first = _bodies(scenario, pulsed, actuators)
-    second = _bodies(_with_seed(scenario, 1), pulsed, actuators)
+    first = bodies(scenario, pulsed, actuators)
+    second = bodies(_with_seed(scenario, 1), pulsed, actuators)
     if all(np.array_equal(a, b) for a, b in zip(first, second, strict=True)):
         return first[0][None], first[1][None]
     drawn = [first, second]
-    drawn += [_bodies(_with_seed(scenario, k), pulsed, actuators) for k in range(2, PLANTS)]
+    drawn += [bodies(_with_seed(scenario, k), pulsed, actuators) for k in range(2, PLANTS)]
     return np.stack([d[0] for d in drawn]), np.stack([d[1] for d in drawn])
 
 
@@ -301,13 +348,45 @@ def _bodies(scenario: Scenario, pulsed: bool, actuators: int) -> tuple[Array, Ar
     for i, row in enumerate(chasers):
         plant = chaser_plant(scenario, i)
         row[:_BODY_ROWS] = _properties(plant)
-        columns = _thruster_columns(scenario, i) if pulsed else _wrench_columns(scenario, i)
-        row[_BODY_ROWS:] = np.concatenate([plant.wrench_in_engine(c) for c in columns])
+        columns = [plant.wrench_in_engine(c) for c in _columns(scenario, i, pulsed)]
+        row[_BODY_ROWS:] = np.concatenate(columns)
     target = target_plant(scenario)
     properties = _properties(target)
     if scenario.target.motion != "torque_free":
         properties[1:4] = 1.0  # equal moments keep a prescribed rate
     return chasers, properties
+
+
+def _stack_bodies(scenario: Scenario, pulsed: bool, actuators: int) -> tuple[Array, Array]:
+    """Return the chasers as `_bodies`, with wrenches in the frame of the stack, and the stack."""
+    mounts = mounted_chasers(scenario)
+    plants = [chaser_plant(scenario, i) for i in mounts]
+    stack = stack_plant(target_plant(scenario), plants, list(mounts.values()))
+    chasers = np.empty((len(mounts), _BODY_ROWS + 6 * actuators))
+    for row, plant, (i, mount) in zip(chasers, plants, mounts.items(), strict=True):
+        row[:_BODY_ROWS] = _properties(plant)
+        columns = columns_in_stack(stack, mount, _columns(scenario, i, pulsed))
+        row[_BODY_ROWS:] = columns.ravel()
+    return chasers, _properties(stack)
+
+
+_Bodies = Callable[[Scenario, bool, int], tuple[Array, Array]]
+
+
+def _stack(scenario: Scenario, pulsed: bool, kind: str) -> tuple[_Stack, Array | IntArray]:
+    """Return what ``detumble`` judges, and the thrusters that stay closed."""
+    limits = scenario.success.detumbled or scenario.detumble
+    rest = limits.speed_m_s, math.radians(limits.rate_deg_s)
+    if kind != "detumble":
+        return _Stack(*rest, _c(np.zeros(3)), None), np.zeros(1)
+    centre = _c(stated_stack(scenario).centre_trf_m)
+    closed = closed_thrusters(scenario) if pulsed else np.zeros((1, 1), dtype=np.int64)
+    return _Stack(*rest, centre, location(closed) if pulsed else None), closed
+
+
+def _columns(scenario: Scenario, chaser: int, pulsed: bool) -> Array:
+    """Return the wrench (actuators, 6), body axes, of each actuator at level 1."""
+    return _thruster_columns(scenario, chaser) if pulsed else _wrench_columns(scenario, chaser)
 
 
 def _properties(plant: Plant) -> Array:
@@ -380,15 +459,45 @@ def _solids(scenario: Scenario) -> Array:
     return np.array(rows)
 
 
-def _sensor(scenario: Scenario, places: ctypes.Array[_Place]) -> tuple[Array, Array]:
-    """Return distances of the sensor's table, and the table for the first chaser; both without
+_NO_SURFACE = Surface(np.zeros((1, 4)), np.zeros((1, 3)), *np.zeros((2, 1), dtype=np.int64))
+"""Of other tasks, whose kernels do not read it: arrays need an address."""
+
+
+def _surface(
+    scenario: Scenario, learning: LearningSection, kind: str
+) -> tuple[_Surface, tuple[Array | IntArray, ...]]:
+    """Return the surface that ``inspect`` has to see, and its arrays."""
+    settings, boxes = learning.inspect, scenario.target_model().boxes
+    found = surface_of(boxes, settings.spacing_m) if kind == "inspect" else _NO_SURFACE
+    faces, points = len(found.box), len(found.points_m)
+    if points > MOST_POINTS:
+        raise ScenarioError(
+            f"{scenario.name}: learning.inspect.spacing_m: {settings.spacing_m:g} m gives {points} "
+            f"points on the target; at most {MOST_POINTS}"
+        )
+    first = np.searchsorted(found.face, np.arange(faces + 1)).astype(np.int64)
+    totals = np.zeros((faces, 4))
+    np.add.at(totals, found.face, np.column_stack([found.points_m, np.ones(points)]))
+    sun = np.array(scenario.camera.sun_direction)
+    arrays = (found.planes, found.points_m, totals, first, found.box.astype(np.int64))
+    numbers = _Surface(
+        faces, points, math.ceil(settings.share * points - 1e-9), settings.sunlit,
+        settings.range_m, math.cos(math.radians(settings.incidence_deg)), extent_m(boxes),
+        _c(sun / np.linalg.norm(sun)), *map(location, arrays),
+    )  # fmt: skip
+    return numbers, arrays
+
+
+def _sensor(scenario: Scenario, kind: str) -> tuple[Array, Array]:
+    """Return distances of the sensor's table, and the table for the first chaser, as it sees the
+    target from the side of its goal, or with ``inspect`` of its reference pose. Both without
     meaning but for the observation ``statistical``.
     """
     learning = scenario.learning
     if learning is None or learning.observation != "statistical":
         return np.arange(2.0), np.zeros((2, 6, 9))
-    goal = np.array(places[0].goal_m)
-    start_m = np.linalg.norm(np.array(places[0].start_m) - scenario.target.position_m)
-    near_m, far_m = 0.8 * float(np.linalg.norm(goal)), 2.0 * float(start_m)
+    goal = goal_of(scenario, 0, "hold" if kind == "inspect" else kind)
+    start_m = np.linalg.norm(scenario.start_pose(0)[0] - scenario.target.position_m)
+    near_m, far_m = 0.8 * float(np.linalg.norm(goal.position_m)), 2.0 * float(start_m)
     distances_m = np.linspace(near_m, max(far_m, 2.0 * near_m), BINS)
-    return distances_m, sensor_table(scenario, goal, np.array(places[0].goal_wxyz), distances_m)
+    return distances_m, sensor_table(scenario, goal.position_m, goal.q_wxyz, distances_m)

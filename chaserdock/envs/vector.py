@@ -27,9 +27,9 @@ _METADATA: dict[str, Any] = {
 class DockingVectorEnv(VectorEnv[ObservationArray, Floats, NDArray[Any]]):
     """See ``chaserdock.envs.make_vec``. What is done starts anew with the next step.
 
-    ``info["outcome"]`` (n,): index in ``OUTCOMES`` (task.py); ``info["is_success"]`` (n,): docked,
-    or held to the end; ``info["rejected"]`` (n,): number of actions of the episode that were not
-    finite, and were taken as zero.
+    ``info["outcome"]`` (n,): index in ``OUTCOMES`` (task.py); ``info["is_success"]`` (n,): whether
+    that is among ``SUCCESSES``; ``info["rejected"]`` (n,): number of actions of the episode that
+    were not finite, and were taken as zero.
     """
 
     metadata = _METADATA

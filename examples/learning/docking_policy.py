@@ -19,6 +19,7 @@ from chaserdock.envs.observation import goal_of, observation_of
 from chaserdock.envs.policy import Policy, PolicyError
 
 FILE = "docking.onnx"
+TASKS = ("hold", "come", "latch")
 
 
 class PolicySolver:
@@ -32,6 +33,16 @@ class PolicySolver:
     def prepare(self, scenario):
         """Check the policy against the mission, and note where its chasers dock."""
         self.policy.check(scenario)
+        if self.policy.task not in TASKS:
+            raise PolicyError(
+                f"{self.policy.path}: is for the task {self.policy.task!r}; this solver flies "
+                f"{', '.join(TASKS)}"
+            )
+        if self.policy.action != "actuators":
+            raise PolicyError(
+                f"{self.policy.path}: its actions are of {self.policy.action!r}; this solver takes "
+                "those of actuators"
+            )
         if self.policy.actuation != "ideal":
             raise PolicyError(
                 f"{self.policy.path}: commands {self.policy.actuation!r}; a solver plans wrenches, "

@@ -21,8 +21,8 @@ FOLDER = Path(__file__).parent
 
 
 def flown(scenario, law, episodes, seed):
-    """Fly episodes by a law that maps batch and observations to actions; return outcome (n,),
-    duration (n,), s, and impulse (n,), N s.
+    """Fly episodes by a law that maps batch and observations to actions; return outcome (n,) of the
+    first chaser, duration (n,), s, and impulse (n,) of all, N s.
     """
     batch = DockingBatch(scenario, episodes)
     seen = batch.start(seed)
@@ -37,7 +37,7 @@ def flown(scenario, law, episodes, seed):
         done = batch.step(actions)
         seen = done.observations
         ticks += flying
-        impulse_N_s += flying * (np.abs(actions[:, 0]) @ batch.task.effort_N_s)
+        impulse_N_s += flying * (np.abs(actions).sum(axis=1) @ batch.task.effort_N_s)
         outcome = np.where(flying, done.outcomes[:, 0], outcome)
     return outcome, ticks * batch.task.numbers.tick_s, impulse_N_s
 

@@ -13,15 +13,23 @@ import numpy as np
 import pytest
 from chaserdock_controller.guidance.approach_cone import cone_of
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.errors import ScenarioError
-from chaserdock_protocol.messages import ActuatorCommand, ThrusterPulse
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.simulation import TARGET, Physics
-from env_cases import ALONG_PORT, REWARD, SEVERAL, START, along_port, docking, learning
+from env_cases import (
+    ALONG_PORT,
+    REWARD,
+    SEVERAL,
+    START,
+    actuator_command,
+    along_port,
+    docking,
+    learning,
+    start_of,
+)
 from numpy.typing import NDArray
 
 from chaserdock.analysis.criteria import nearest_allowed_m
@@ -47,43 +55,6 @@ GENERAL = (
 )
 
 
-def command(scenario: Scenario, tick: int, action: Array) -> ActuatorCommand:
-    """The command of the world's actuators for an action (actuators,)."""
-    timing, body = scenario.timing, scenario.chaser
-    at = timing.step_of_tick(tick) + timing.latency_steps
-    given: dict[str, Any] = {"force_N": (0.0,) * 3, "torque_N_m": (0.0,) * 3, "pulses": ()}
-    if body.actuation == "ideal":
-        wrench = (np.clip(action, -1.0, 1.0) * body.wrench_max).tolist()
-        given |= {"force_N": tuple(wrench[:3]), "torque_N_m": tuple(wrench[3:])}
-    else:
-        pulses = []
-        for k, (thruster, level) in enumerate(
-            zip(body.thrusters, np.clip(action, 0.0, 1.0).tolist(), strict=True)
-        ):
-            steps = int(level * timing.steps_per_tick + 0.5)
-            off_s = (timing.steps_per_tick - steps) / timing.physics_hz
-            if off_s <= thruster.fall_s + 1e-9:
-                steps = timing.steps_per_tick
-            if steps / timing.physics_hz >= thruster.min_on_s - 1e-9:
-                pulses.append(
-                    ThrusterPulse(
-                        thruster=k,
-                        open_ns=timing.time_ns(at),
-                        close_ns=timing.time_ns(at + steps),
-                    )
-                )
-        given["pulses"] = tuple(pulses)
-    return ActuatorCommand(
-        chaser=0,
-        tick=tick,
-        seq=tick,
-        sim_time_ns=timing.tick_time_ns(tick),
-        effective_time_ns=timing.time_ns(at),
-        source="command",
-        **given,
-    )
-
-
 def worst_difference(scenario: Scenario, ticks: int) -> float:
     """The largest difference of a position, m, between the second of three environments and the
     world, in free flight for a third of the time and then under random actions.
@@ -99,7 +70,7 @@ def worst_difference(scenario: Scenario, ticks: int) -> float:
             actions[:] = 0.0
         actions = actions.astype(np.float32)
         step = timing.step_of_tick(tick)
-        sent = command(scenario, tick, actions[1, 0].astype(float))
+        sent = actuator_command(scenario, tick, actions[1, 0].astype(float))
         actuators["chaser/0"].command(sent, step + timing.latency_steps, step)
         fly_to(timing.step_of_tick(tick + 1), physics, actuators, 1.0 / timing.physics_hz)
         actuators["chaser/0"].take_output(timing.step_of_tick(tick + 1))
@@ -428,12 +399,19 @@ def flown(batch: DockingBatch, seed: int, ticks: int = 120) -> list[NDArray[Any]
     return out
 
 
-@pytest.mark.parametrize("observation", ["truth", "statistical"])
+@pytest.mark.parametrize(
+    ("task", "observation"),
+    [("dock", "truth"), ("dock", "statistical"), ("inspect", "statistical"), ("detumble", "truth")],
+)
 def test_equal_seeds_repeat_to_the_bit_whatever_the_number_of_environments(
-    observation: str,
+    task: str, observation: str
 ) -> None:
     scenario = docking(
-        'truth.preset="mismatch"', observation=observation, start=START, episode_s=3.0
+        'truth.preset="mismatch"',
+        task=task,
+        observation=observation,
+        start=start_of(task),
+        episode_s=3.0,
     )
     small, large = flown(DockingBatch(scenario, 2), 11), flown(DockingBatch(scenario, 9), 11)
     assert all(np.array_equal(a, b) for a, b in zip(small, large, strict=True))
@@ -448,17 +426,21 @@ def test_equal_seeds_repeat_to_the_bit_whatever_the_number_of_environments(
 
 
 @pytest.mark.parametrize("level", [2, 3])
-@pytest.mark.parametrize("actuation", ["ideal", "thrusters"])
+@pytest.mark.parametrize(
+    ("task", "actuation"),
+    [("dock", "ideal"), ("dock", "thrusters"), ("inspect", "ideal"), ("detumble", "thrusters")],
+)
 def test_every_instruction_set_flies_the_same_bits(
-    level: int, actuation: str, monkeypatch: pytest.MonkeyPatch
+    level: int, task: str, actuation: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if native.LIBRARY.level < level:
         pytest.skip(f"this processor has no copy {level}")
     scenario = docking(
         'truth.preset="mismatch"',
         f'chaser.actuation="{actuation}"',
-        observation="statistical",
-        start=START,
+        task=task,
+        observation="truth" if task == "detumble" else "statistical",
+        start=start_of(task),
         episode_s=3.0,
     )
     expected, own = flown(DockingBatch(scenario, 2), 1), native.function
@@ -606,7 +588,7 @@ def test_a_scenario_without_the_table_is_one_line() -> None:
 @pytest.mark.parametrize(
     ("table", "text"),
     [
-        ({"task": "juggle"}, "learning.task: must be one of hold, dock"),
+        ({"task": "juggle"}, "learning.task: must be one of hold, dock, inspect, detumble"),
         ({"episode_s": 0.01}, "learning.episode_s: 0.01 s is shorter than a tick"),
         ({"start": {"position_m": [0.6, 0.0, 0.0]}},
          "learning.start.position_m: chaser 0 could start 0.401 m from the target"),

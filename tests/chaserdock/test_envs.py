@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import re
 import subprocess
@@ -17,7 +18,7 @@ import pytest
 from chaserdock_protocol.errors import ChaserdockError, ScenarioError
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_world.rendering.cameras import Cameras
-from env_cases import ALONG_PORT, SEVERAL, START, along_port, docking, learning
+from env_cases import ALONG_PORT, SEVERAL, START, along_port, docking, learning, start_of
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 from harness import ROOT
@@ -37,9 +38,17 @@ def several(**changes: Any) -> Scenario:
     return parse_scenario(values, "test")
 
 
-@pytest.mark.parametrize("actuation", ["ideal", "thrusters"])
-def test_gymnasium_accepts_an_environment(actuation: str) -> None:
-    scenario = docking(f'chaser.actuation="{actuation}"', start=START)
+@pytest.mark.parametrize("task", ["dock", "inspect", "detumble"])
+@pytest.mark.parametrize(
+    ("actuation", "action"),
+    [("ideal", "actuators"), ("thrusters", "actuators"), ("ideal", "reference")],
+)
+def test_gymnasium_accepts_an_environment(actuation: str, action: str, task: str) -> None:
+    if (task, action) == ("detumble", "reference"):
+        pytest.skip("the NMPC flies free chasers")
+    scenario = docking(
+        f'chaser.actuation="{actuation}"', task=task, action=action, start=start_of(task)
+    )
     environment = envs.make(scenario, render_mode="rgb_array")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -111,7 +120,14 @@ def test_seeds_repeat_and_starts_without_one_differ() -> None:
 def test_pettingzoo_accepts_environments_of_one_to_sixteen_chasers() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for scenario in (docking(start=START, episode_s=3.0), several(), sixteen()):
+        for scenario in (
+            docking(start=START, episode_s=3.0),
+            several(),
+            several(learning=learning("inspect", episode_s=3.0)),
+            several(learning=learning("detumble", episode_s=3.0)),
+            several(learning=learning(action="reference", episode_s=3.0)),
+            sixteen(),
+        ):
             parallel_api_test(envs.parallel_env(scenario), num_cycles=100)
             parallel_seed_test(lambda s=scenario: envs.parallel_env(s), num_cycles=20)
 
@@ -339,9 +355,33 @@ def test_the_proportional_law_of_the_example_docks() -> None:
     assert counts["docked"] >= 196
 
 
-@pytest.mark.parametrize("name", ["docking", "holding"])
+@pytest.mark.slow
+def test_the_team_of_the_example_docks_without_coming_near_each_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The ways of two chasers cross: without evasion they come too near."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    for name in ("team", "proportional"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    team = importlib.import_module("team")
+    environment = envs.parallel_env(team.SCENARIO)
+    limit_m = envs.loaded(team.SCENARIO).limits.min_distance_chasers_m
+    episode = team.fly(environment, 3)
+    assert set(episode.outcomes.values()) == {"docked"}
+    assert episode.nearest_m > limit_m
+    monkeypatch.setattr(team, "AWAY_PER_S", 0.0)
+    episode = team.fly(environment, 3)
+    assert "too near" in episode.outcomes.values()
+
+
+@pytest.mark.parametrize("name", ["docking", "holding", "inspecting", "team"])
 def test_tasks_of_the_examples_have_rewards(name: str) -> None:
-    environment = envs.make(EXAMPLES / f"{name}.toml")
+    environment = envs.parallel_env(EXAMPLES / f"{name}.toml")
     environment.reset(seed=1)
-    rewards = [environment.step(environment.action_space.sample())[1] for _ in range(3)]
-    assert len({*rewards, 0.0}) == 4
+    for agent in environment.agents:
+        environment.action_space(agent).seed(1)
+    rewards = set[float]()
+    for _ in range(3):
+        actions = {a: environment.action_space(a).sample() for a in environment.agents}
+        rewards |= set(environment.step(actions)[1].values())
+    assert len({*rewards, 0.0}) >= 4

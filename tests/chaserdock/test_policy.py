@@ -97,7 +97,7 @@ def test_observation_from_states_is_that_of_the_environment(kind: str) -> None:
         levels = rng.uniform(-1.0, 1.0, (3, batch.chasers, batch.task.actuators))
         seen = batch.step(levels).observations
     task = TASKS[batch.task.numbers.task]
-    assert seen.shape[-1] == len(names_of(batch.chasers))
+    assert seen.shape[-1] == len(names_of(batch.chasers, task))
     for e in range(3):
         states = [batch.state(e, i) for i in range(batch.chasers)]
         target = batch.state(e, None)
@@ -146,7 +146,7 @@ def test_a_policy_for_another_scenario_is_refused_in_one_line(example: Any, tmp_
         f"{path}: observes 22 elements, docking-contact has 16; from element 16 on: other_1_x_m, "
         "other_1_y_m, other_1_z_m, not nothing"
     )
-    names = list(names_of(1))
+    names = list(names_of(1, "latch"))
     names[4], names[5] = names[5], names[4]
     written(example, path, scenario, observation=json.dumps(names))
     with pytest.raises(PolicyError, match=r"from element 4 on: velocity_z_m_s, velocity_y_m_s, "):
@@ -169,7 +169,7 @@ def test_a_file_that_is_no_policy_is_named_in_one_line(example: Any, tmp_path: P
     with pytest.raises(PolicyError, match=f"^{re.escape(str(path))}: no policy with the metadata"):
         Policy(path)
     scenario = docking('chaser.actuation="ideal"')
-    written(example, path, scenario, observation=json.dumps(names_of(1)[:-1]))
+    written(example, path, scenario, observation=json.dumps(names_of(1, "latch")[:-1]))
     with pytest.raises(PolicyError, match="its metadata name 15 elements, its network takes 16"):
         Policy(path)
 
@@ -243,12 +243,20 @@ def test_the_solver_flies_rows_that_dock_by_the_policy_and_others_by_the_nmpc(
     assert alone.status == ("solved",) * 3
 
 
-def test_a_policy_of_thrusters_is_no_solver(
+def test_a_policy_of_thrusters_of_another_task_or_of_references_is_no_solver(
     example: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written(example, tmp_path / "p.onnx", docking())
     with pytest.raises(PolicyError, match=r"commands 'thrusters'; a solver plans wrenches"):
         solver_for(example, tmp_path / "p.onnx", docking(), monkeypatch)
+    inspecting = docking('chaser.actuation="ideal"', task="inspect")
+    written(example, tmp_path / "p.onnx", inspecting)
+    with pytest.raises(PolicyError, match=r"task 'inspect'; this solver flies hold, come, latch"):
+        solver_for(example, tmp_path / "p.onnx", inspecting, monkeypatch)
+    ideal = docking('chaser.actuation="ideal"', action="reference")
+    written(example, tmp_path / "p.onnx", ideal)
+    with pytest.raises(PolicyError, match=r"its actions are of 'reference'; this solver takes"):
+        solver_for(example, tmp_path / "p.onnx", ideal, monkeypatch)
 
 
 def test_a_solver_is_prepared_before_the_flight_and_its_errors_are_named() -> None:

@@ -41,6 +41,28 @@ static Place *places(int64_t count) {
     return all;
 }
 
+/* Faces of any cuboids, some without points. */
+static Surface surface(int64_t boxes) {
+    const int64_t faces = boxes > 0 ? whole(1, 5) : 1, points = whole(1, 9);
+    int64_t *first = wholes(faces + 1, 0, 0);
+    double *planes = doubles(4 * faces, -0.3, 0.3), *points_m = doubles(3 * points, -0.5, 0.5);
+    double *totals = outputs(4 * faces);
+    zero(totals, 4 * faces);
+    for (int64_t k = 0; k < faces; k++) {
+        first[k + 1] = k == faces - 1 ? points : whole(first[k], points);
+        for (int64_t p = first[k]; p < first[k + 1]; p++) {
+            for (int i = 0; i < 3; i++) totals[4 * k + i] += points_m[3 * p + i];
+            totals[4 * k + 3] += 1.0;
+        }
+    }
+    Surface s = {.faces = faces, .points = points, .needed = whole(1, points),
+                 .sunlit = whole(0, 1), .range_m = value(0.1, 3.0), .least_cosine = value(0.0, 1.0),
+                 .extent_m = value(0.5, 3.0), .planes = planes, .points_m = points_m,
+                 .totals = totals, .first = first, .box = wholes(faces, 0, boxes > 0 ? boxes - 1 : 0)};
+    fill(s.to_sun, 3, -1.0, 1.0);
+    return s;
+}
+
 static Task task_of_any(void) {
     const int64_t n = whole(1, 6), m = whole(1, 3), steps = whole(1, 9), actuators = whole(1, 7);
     const int64_t count = whole(1, 3), boxes = whole(0, 3), bins = whole(2, 5);
@@ -48,8 +70,14 @@ static Task task_of_any(void) {
               .target_pitch = (n + 3) / 4 * 4, .actuators = actuators, .pulsed = whole(0, 1),
               .steps = steps, .latency_steps = whole(0, steps), .episode_ticks = whole(1, 4),
               .held_ticks = whole(1, 3), .image_ticks = whole(1, 2), .plants = count,
-              .boxes = boxes, .bins = bins, .task = whole(HOLD, LATCH), .statistical = whole(0, 1),
-              .width = 16 + 3 * (m - 1)};
+              .boxes = boxes, .bins = bins, .task = whole(HOLD, DETUMBLE), .statistical = whole(0, 1)};
+    t.width = 16 + 3 * (m - 1);
+    if (t.task == INSPECT) t.width += SURFACE_ELEMENTS;
+    if (t.task == DETUMBLE) t.width += STACK_ELEMENTS;
+    t.surface = surface(boxes);
+    t.stack = (Stack){.speed_m_s = value(0.0, 0.1), .rate_rad_s = value(0.0, 0.2)};
+    fill(t.stack.centre_m, 3, -0.2, 0.2);
+    if (chance(0.5)) t.stack.closed = wholes(m * actuators, 0, 1);
     t.step_s = value(0.001, 0.01), t.tick_s = value(0.01, 0.1), t.reach_m = value(0.3, 0.5);
     fill(t.half_m, 3, 0.05, 0.2);
     t.keep_target_m = value(0.0, 0.8), t.keep_chasers_m = value(0.0, 0.5);
@@ -104,6 +132,7 @@ static Batch batch_of(const Task *t) {
                .memory = zeros(MEMORY_ROWS * pitch),
                .docked = zeros(DOCKED_ROWS * pitch),
                .errors = zeros(ERROR_ROWS * pitch),
+               .unseen = zeros(4 * t->surface.faces * n),
                .work = outputs(24 * t->steps),
                .pulse = wholes(t->actuators * all, 0, 0),
                .opened = wholes(t->actuators * all, 0, 0),
@@ -115,6 +144,7 @@ static Batch batch_of(const Task *t) {
                .actions = actions,
                .observations = block((size_t)(all * t->width) * sizeof(float)),
                .rewards = outputs(pitch),
+               .seen = bytes(n * t->surface.points),
                .terminated = bytes(all),
                .truncated = bytes(all),
                .rejected = wholes(n, 5, 5),
@@ -126,7 +156,7 @@ static Batch batch_of(const Task *t) {
 static void check(const Task *t, const Batch *b) {
     for (int64_t i = 0; i < t->environments * t->chasers; i++) {
         const int64_t outcome = b->outcome[i], e = i / t->chasers;
-        CHECK(outcome >= FLYING && outcome <= AFTER_OTHERS);
+        CHECK(outcome >= FLYING && outcome <= STOPPED);
         CHECK(b->terminated[i] <= 1 && b->truncated[i] <= 1 && b->plant[e] < t->plants);
         CHECK(!b->truncated[i] || outcome == HELD || outcome == TIME_OUT);
         CHECK(!b->terminated[i] || (outcome != FLYING && outcome != TIME_OUT));
@@ -143,6 +173,8 @@ static void start_batch(void) {
     Batch b = batch_of(&t);
     NAME(start_batch)(&t, &b);
     for (int64_t e = 0; e < t.environments; e++) CHECK(!b.done[e] && !b.rejected[e] && !b.age[e]);
+    for (int64_t p = 0; t.task == INSPECT && p < t.environments * t.surface.points; p++)
+        CHECK(!b.seen[p]);
     check(&t, &b);
 }
 

@@ -3,38 +3,10 @@
 #ifndef CHASERDOCK_JUDGE_H
 #define CHASERDOCK_JUDGE_H
 
+#include "latched.h"
 #include "observe.h"
 #include "probe.h"
-
-/* Fix a chaser that docks to its target, where it is. */
-static void fix_to_target(const Task *t, Batch *b, int64_t chaser, const Motion *target) {
-    double y[MOTION_ROWS], apart[3], place[3], back[4], q[4];
-    for (int i = 0; i < MOTION_ROWS; i++) y[i] = b->bodies[i * t->pitch + chaser];
-    subtract3(y, target->x, apart);
-    q_rotate_inverse(target->q, apart, place);
-    q_conjugate(target->q, back);
-    q_multiply(back, y + ATTITUDE, q);
-    for (int i = 0; i < 3; i++) b->docked[i * t->pitch + chaser] = place[i];
-    for (int i = 0; i < 4; i++) b->docked[(3 + i) * t->pitch + chaser] = q[i];
-}
-
-/* Move a docked chaser with its target. */
-static void carry(const Task *t, Batch *b, int64_t chaser, const Motion *target) {
-    double fixed[DOCKED_ROWS], place[3], turning[3], q[4], w[3];
-    for (int i = 0; i < DOCKED_ROWS; i++) fixed[i] = b->docked[i * t->pitch + chaser];
-    q_rotate(target->q, fixed, place);
-    cross3(target->w, fixed, turning);
-    q_rotate(target->q, turning, turning);
-    q_multiply(target->q, fixed + 3, q);
-    q_rotate_inverse(fixed + 3, target->w, w);
-    double *rows = b->bodies + chaser;
-    for (int i = 0; i < 3; i++) {
-        rows[(POSITION + i) * t->pitch] = target->x[i] + place[i];
-        rows[(VELOCITY + i) * t->pitch] = target->v[i] + turning[i];
-        rows[(RATE + i) * t->pitch] = w[i];
-    }
-    for (int i = 0; i < 4; i++) rows[(ATTITUDE + i) * t->pitch] = q[i];
-}
+#include "surface.h"
 
 /* Whether a chaser is nearer to the target than allowed: nearer than the criterion of missions, or
  * nearer than the keep-out distance outside of its cone. */
@@ -66,6 +38,46 @@ static int event_of(const Task *t, const Place *place, const Relative *s, const 
     return FLYING;
 }
 
+/* Judge a stack after a tick, as `judge` does free chasers: all chasers have one outcome. */
+static void judge_stack(const Task *t, Batch *b, int64_t e) {
+    const int64_t first = e * t->chasers, pitch = t->pitch;
+    const Weights *w = &t->weights;
+    Motion target;
+    Relative states[MAX_CHASERS];
+    double others[3 * MAX_CHASERS], speed, rate;
+    read_motion(b->targets + e, t->target_pitch, &target);
+    stack_rates(t, b, e, &speed, &rate);
+    b->age[e]++;
+    const int good = speed <= t->stack.speed_m_s && rate <= t->stack.rate_rad_s;
+    double *memory = b->memory + first, *ticks = memory + WITHIN * pitch;
+    const double slower = memory[AWAY * pitch] - speed, calmer = memory[TURNED * pitch] - rate;
+    memory[AWAY * pitch] = speed, memory[TURNED * pitch] = rate;
+    *ticks = good ? *ticks + 1.0 : 0.0;
+    int event = !(rate <= t->fastest_rad_s)                ? LOST
+                : *ticks >= (double)t->held_ticks          ? STOPPED
+                : b->age[e] >= t->episode_ticks            ? TIME_OUT
+                                                           : FLYING;
+    for (int64_t i = 0; i < t->chasers; i++) {
+        Motion m;
+        carry(t, b, first + i, &target);
+        read_motion(b->bodies + first + i, pitch, &m);
+        relative_motion(&m, &target, states + i);
+        copy(states[i].r, others + 3 * i, 3);
+    }
+    for (int64_t i = 0; i < t->chasers; i++) {
+        double *reward = b->rewards + first + i;
+        *reward = w->drift_per_m_s * slower + w->spin_per_rad_s * calmer -
+                  w->impulse_per_N_s * *reward -
+                  t->tick_s * (w->time_per_s - (good ? w->within_per_s : 0.0)) +
+                  (event == STOPPED ? w->success : 0.0) - (event == LOST ? w->failure : 0.0);
+        b->outcome[first + i] = event;
+        b->terminated[first + i] = event == STOPPED || event == LOST;
+        b->truncated[first + i] = event == TIME_OUT;
+        observe(t, b, first + i, i, states + i, &target, others);
+    }
+    b->done[e] = event != FLYING;
+}
+
 /* Judge an environment after a tick: outcome, reward and observation of each chaser. `rewards` holds
  * the impulse of each. */
 static void judge(const Task *t, Batch *b, int64_t e) {
@@ -73,8 +85,8 @@ static void judge(const Task *t, Batch *b, int64_t e) {
     const Weights *w = &t->weights;
     Motion target;
     Relative states[MAX_CHASERS];
-    double others[3 * MAX_CHASERS];
-    int failed = 0, flying = 0;
+    double others[3 * MAX_CHASERS], gained[MAX_CHASERS];
+    int failed = 0, flying = 0, complete = 0;
     read_motion(b->targets + e, t->target_pitch, &target);
     b->age[e]++;
     for (int64_t i = 0; i < count; i++) {
@@ -84,6 +96,7 @@ static void judge(const Task *t, Batch *b, int64_t e) {
         relative_motion(&m, &target, states + i);
         copy(states[i].r, others + 3 * i, 3);
     }
+    if (t->task == INSPECT) complete = inspect(t, b, e, states, &target, gained);
     for (int64_t i = 0; i < count; i++) {
         const int64_t chaser = first + i;
         double *reward = b->rewards + chaser;
@@ -105,6 +118,7 @@ static void judge(const Task *t, Batch *b, int64_t e) {
             if (k != i && dot3(apart, apart) < t->keep_chasers_m * t->keep_chasers_m)
                 event = TOO_NEAR;
         }
+        if (event == FLYING && complete) event = INSPECTED;
         if (event == FLYING && b->age[e] >= t->episode_ticks)
             event = t->task == HOLD && *ticks >= (double)t->held_ticks ? HELD : TIME_OUT;
         const ProbeLimits *limits = now.gap < t->final_m ? &t->final : &t->corridor;
@@ -114,11 +128,12 @@ static void judge(const Task *t, Batch *b, int64_t e) {
                   t->tick_s * (w->distance_per_m_s * now.away + w->angle_per_rad_s * now.turned +
                                w->time_per_s + (outside ? w->corridor_per_s : 0.0) -
                                (good ? w->within_per_s : 0.0));
-        if (event == DOCKED || event == HELD) *reward += w->success;
+        if (t->task == INSPECT) *reward += w->seen * gained[i];
+        if (event == DOCKED || event == HELD || event == INSPECTED) *reward += w->success;
         b->outcome[chaser] = event;
         if (event == DOCKED) fix_to_target(t, b, chaser, &target);
         b->terminated[chaser] = event == DOCKED || event == COLLIDED || event == TOO_NEAR ||
-                                event == LOST;
+                                event == LOST || event == INSPECTED;
         b->truncated[chaser] = event == HELD || event == TIME_OUT;
         failed |= event == COLLIDED || event == TOO_NEAR || event == LOST;
         flying |= event == FLYING;

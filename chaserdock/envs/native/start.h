@@ -3,8 +3,10 @@
 #ifndef CHASERDOCK_START_H
 #define CHASERDOCK_START_H
 
+#include "latched.h"
 #include "observe.h"
 #include "probe.h"
+#include "surface.h"
 
 static inline void spread3(uint64_t *random, double half_width, double *out) {
     for (int i = 0; i < 3; i++) out[i] = half_width * next_uniform(random);
@@ -27,6 +29,8 @@ static void start(const Task *t, Batch *b, int64_t e) {
     for (int i = 0; i < 3; i++) target.w[i] += spread[i];
     place_body(&target, t->target_plants + plant * (BODY_ROWS - MASS), t->target_pitch,
                b->targets + e);
+    for (int i = 0; i < 6 && t->task == DETUMBLE; i++)
+        b->wrench[i * pitch + e] = b->targets[(DISTURBANCE + i) * t->target_pitch + e];
     for (int64_t number = 0; number < t->chasers; number++) {
         const int64_t chaser = e * t->chasers + number;
         const Place *place = t->places + number;
@@ -41,13 +45,16 @@ static void start(const Task *t, Batch *b, int64_t e) {
         spread3(random, t->spread_m_s, m.v);
         for (int i = 0; i < 3; i++) m.v[i] += place->start_velocity_m_s[i];
         spread3(random, t->spread_rad_s, m.w);
+        if (t->task == DETUMBLE) latched_motion(place, &target, &m);
         place_body(&m, body, pitch, b->bodies + chaser);
-        for (int i = 0; i < 6; i++)
+        if (t->task == DETUMBLE) fix_to_target(t, b, chaser, &target);
+        for (int i = 0; i < 6 && t->task != DETUMBLE; i++)
             b->wrench[i * pitch + chaser] = body[DISTURBANCE - MASS + i];
         for (int64_t j = 0; j < t->actuators; j++)
             b->pulse[chaser * t->actuators + j] = b->opened[chaser * t->actuators + j] = 0;
     }
     read_motion(b->targets + e, t->target_pitch, &target);
+    if (t->task == INSPECT) forget_surface(t, b, e);
     Relative states[MAX_CHASERS];
     for (int64_t number = 0; number < t->chasers; number++) {
         Motion m;
@@ -61,6 +68,9 @@ static void start(const Task *t, Batch *b, int64_t e) {
         probe_state(t, t->places + number, states + number, &now);
         remember(t, b, chaser, &now);
         b->memory[WITHIN * pitch + chaser] = 0.0;
+        if (t->task == DETUMBLE)
+            stack_rates(t, b, e, b->memory + AWAY * pitch + chaser,
+                        b->memory + TURNED * pitch + chaser);
         if (t->statistical) draw_errors(t, b, e, chaser, states + number);
         observe(t, b, chaser, number, states + number, &target, others);
         b->rewards[chaser] = 0.0, b->outcome[chaser] = FLYING;

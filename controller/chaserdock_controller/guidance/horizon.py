@@ -10,6 +10,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, length
 from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_models.plane import flattened
+from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.shape_distance import box_table, moved
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.planar import height_m, up_in_target
@@ -27,7 +28,11 @@ from .trajectories import Escape
 
 
 def target_path(
-    body: TargetBody, torque_free: bool, start: TargetState, step_s: float, steps: int
+    body: TargetBody,
+    torque_free: bool,
+    start: TargetState | BodyState,
+    step_s: float,
+    steps: int,
 ) -> TargetPath:
     """Return the target's predicted motion at 0, step_s, ... steps * step_s, followed by that at
     the midpoints.

@@ -67,10 +67,25 @@ class LearningReward(Section):
     )
     within_per_s: Number = Field(
         default=0.0,
-        description="For each second within `approach.docked_position_m` and `docked_angle_deg`.",
+        description="For each second within `approach.docked_position_m` and `docked_angle_deg`; "
+        "with `detumble` within the limits of rest.",
     )
     time_per_s: Number = Field(default=0.0, description="Lost for each second.")
-    success: Number = Field(default=0.0, description="For docking, and for holding to the end.")
+    seen: Number = Field(
+        default=0.0,
+        description="`inspect`: for all points of the surface; each chaser gets the share of those "
+        "that it is the first to see.",
+    )
+    spin_per_rad_s: Number = Field(
+        default=0.0,
+        description="`detumble`: for each radian/s by which the rate of the stack falls.",
+    )
+    drift_per_m_s: Number = Field(
+        default=0.0,
+        description="`detumble`: for each m/s by which the speed of the stack's centre of mass "
+        "(WRF) falls.",
+    )
+    success: Number = Field(default=0.0, description="For the task's success.")
     failure: Number = Field(
         default=0.0,
         description="Lost by every chaser that still flies when one collides, comes too near or "
@@ -78,14 +93,61 @@ class LearningReward(Section):
     )
 
 
-class LearningSection(Section):
-    """Task and reward of a training environment ([learning.md](learning.md)). Its criteria are
-    those of missions: `approach`, `docking`, `limits`.
+class LearningInspection(Section):
+    """When a point of the target's surface counts as seen by the task `inspect`: in an image, near
+    enough, at no flat angle, hidden by no cuboid of the target, and sunlit.
     """
 
-    task: Literal["hold", "dock"] = Field(
+    share: float = Field(
+        default=0.95,
+        gt=0.0,
+        le=1.0,
+        allow_inf_nan=False,
+        description="Share of the points that all chasers together have to see.",
+    )
+    spacing_m: Positive = Field(
+        default=0.1, description="Largest distance of neighbouring points on a face, m."
+    )
+    range_m: Positive = Field(
+        default=2.0, description="Largest distance of a point from the camera, m."
+    )
+    incidence_deg: float = Field(
+        default=70.0,
+        gt=0.0,
+        le=90.0,
+        allow_inf_nan=False,
+        description="Largest angle between line of sight and normal of the face, degrees.",
+    )
+    sunlit: bool = Field(
+        default=True,
+        description="Whether a point must be in the light of `camera.sun_direction`, and in no "
+        "shadow of the target.",
+    )
+
+
+class LearningReference(Section):
+    """Largest offsets of the NMPC's reference by the action `reference`."""
+
+    position_m: Positive = Field(default=0.5, description="Along each axis (TRF), m.")
+    rotation_deg: HalfTurn = Field(
+        default=20.0, description="Of the rotation vector along each axis (CRF), degrees."
+    )
+
+
+class LearningSection(Section):
+    """Task and reward of a training environment ([learning.md](learning.md)). Its criteria are
+    those of missions: `approach`, `docking`, `limits`, `detumble`.
+    """
+
+    task: Literal["hold", "dock", "inspect", "detumble"] = Field(
         description="`hold`: stay at the reference pose. `dock`: come to the docking distance or "
-        "into the port, as `docking.kind` says."
+        "into the port, as `docking.kind` says. `inspect`: see the target's surface. `detumble`: "
+        "latched to the target, stop it."
+    )
+    action: Literal["actuators", "reference"] = Field(
+        default="actuators",
+        description="`actuators`: those of `chaser.actuation`. `reference`: offsets of the "
+        "reference that the NMPC follows.",
     )
     observation: Literal["truth", "statistical", "images"] = Field(
         default="truth",
@@ -95,6 +157,8 @@ class LearningSection(Section):
     episode_s: Positive = Field(description="Longest episode, s. At least a tick.")
     start: LearningStart = LearningStart()
     reward: LearningReward = LearningReward()
+    inspect: LearningInspection = LearningInspection()
+    reference: LearningReference = LearningReference()
 
 
 def check_learning(scenario: Scenario) -> None:
@@ -110,13 +174,49 @@ def check_learning(scenario: Scenario) -> None:
             f"learning.episode_s: {learning.episode_s:g} s is shorter than a tick of "
             f"{1.0 / scenario.time.rate_hz:g} s"
         )
-    if learning.task == "dock" and scenario.docking.kind == "capture":
+    if learning.task == "detumble" or (
+        learning.task == "dock" and scenario.docking.kind == "capture"
+    ):
         portless = [i for i in range(count) if scenario.docking.port_of(i) is None]
         if portless:
             raise ValueError(
                 f"learning.task: chasers {', '.join(map(str, portless))} have no port to dock at"
             )
-    _check_spread(scenario, math.hypot(*learning.start.position_m))
+    if learning.action == "reference":
+        _check_reference(scenario, learning)
+    if learning.task == "detumble":
+        _check_stack(learning)
+    else:
+        _check_spread(scenario, math.hypot(*learning.start.position_m))
+
+
+def _check_reference(scenario: Scenario, learning: LearningSection) -> None:
+    """Raise ValueError if the NMPC cannot fly the chasers."""
+    if learning.task == "detumble":
+        raise ValueError('learning.action: "reference" is for free chasers, not for "detumble"')
+    if scenario.chaser.actuation != "ideal":
+        raise ValueError('learning.action: "reference" needs chaser.actuation = "ideal"')
+
+
+def _check_stack(learning: LearningSection) -> None:
+    """Raise ValueError for keys without a meaning for latched chasers."""
+    if learning.observation != "truth":
+        raise ValueError(
+            'learning.observation: "detumble" has "truth" only; latched chasers know their motion '
+            "from odometry, whose errors environments do not have"
+        )
+    start = learning.start
+    spreads = {
+        "position_m": any(start.position_m),
+        "rotation_deg": start.rotation_deg,
+        "velocity_m_s": start.velocity_m_s,
+        "rate_deg_s": start.rate_deg_s,
+    }
+    if found := [key for key, spread in spreads.items() if spread]:
+        raise ValueError(
+            f'learning.start.{found[0]}: must be 0 for "detumble", whose chasers start at their '
+            "ports; target_rate_deg_s spreads the rate"
+        )
 
 
 def _check_spread(scenario: Scenario, reach_m: float) -> None:

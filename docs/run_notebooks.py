@@ -2,8 +2,8 @@
 """Execute the notebooks of examples/ and store their outputs: ``python docs/run_notebooks.py [NAME
 ...]`` (default: all).
 
-Each runs in a new folder, from which ``../tests`` is that of the clone. Needs the packages of
-requirements-dev.txt.
+Each runs in a new folder, from which ``../tests`` and ``learning`` are those that it has beside it.
+Needs the packages of requirements-dev.txt.
 """
 
 from __future__ import annotations
@@ -26,10 +26,14 @@ EXAMPLES = ROOT / "examples"
 TIMEOUT_S = 600
 
 
-def executed(path: Path, folder: Path) -> Any:
-    """Return the notebook with the outputs of an execution in ``folder``. Raises
+def executed(path: Path, top: Path) -> Any:
+    """Return the notebook with the outputs of an execution in a new folder of ``top``. Raises
     CellExecutionError.
     """
+    folder = top / "work"
+    folder.mkdir()
+    (top / "tests").symlink_to(ROOT / "tests")
+    (folder / "learning").symlink_to(EXAMPLES / "learning")
     notebook = nbformat.read(path, as_version=4)
     client = NotebookClient(
         notebook, timeout=TIMEOUT_S, resources={"metadata": {"path": str(folder)}}
@@ -69,10 +73,7 @@ def main() -> int:
     for name in names:
         path = EXAMPLES / f"{name}.ipynb"
         with tempfile.TemporaryDirectory(prefix="chaserdock-notebook-") as top:
-            folder = Path(top) / "work"
-            folder.mkdir()
-            (Path(top) / "tests").symlink_to(ROOT / "tests")
-            nbformat.write(executed(path, folder), path)
+            nbformat.write(executed(path, Path(top)), path)
         print(path.relative_to(ROOT))
     return 0
 

@@ -5,7 +5,8 @@
 """Train a policy that docks, by proximal policy optimization: ``python train.py [--out FILE]``.
 
 It begins as a copy of the law of proportional.py, and improves by trying. One process; a step of
-all environments, the network and its training share one core. J. Schulman et al., "Proximal policy
+all environments, the network and its training share one core. With ``--cluster`` the workers of a
+Dask cluster fly the environments, an even share each. J. Schulman et al., "Proximal policy
 optimization algorithms", 2017, with generalized advantage estimation (2016).
 """
 
@@ -163,13 +164,13 @@ def advantages(critic, trace, z, rewards, terminated, done, started):
 class Flights:
     """Environments with the scale of their observations, and the episodes that ended."""
 
-    def __init__(self, scenario, seed):
-        self.batch = DockingBatch(scenario, ENVIRONMENTS)
+    def __init__(self, scenario, seed, environments=ENVIRONMENTS):
+        self.batch = DockingBatch(scenario, environments)
         self.seen = self.batch.start(seed)
-        self.ended = np.zeros(ENVIRONMENTS, dtype=bool)
+        self.ended = np.zeros(environments, dtype=bool)
         self.middle = np.zeros(self.seen.shape[-1], np.float32)
         self.scale = np.ones(self.seen.shape[-1], np.float32)
-        self.ticks, self.sums = np.zeros(ENVIRONMENTS), np.zeros(ENVIRONMENTS)
+        self.ticks, self.sums = np.zeros(environments), np.zeros(environments)
         self.episodes = []
 
     def normalized(self):
@@ -189,25 +190,60 @@ class Flights:
         self.episodes.append(np.stack([c[self.ended] for c in columns], axis=1))
         return done, started
 
-    def spread_out(self, law):
-        """Fly by a law, and start some environments anew in each tick, so that batches contain all
-        parts of an episode.
+    def spread_out(self, policy):
+        """Fly by a policy, and start some environments anew in each tick, so that batches contain
+        all parts of an episode.
         """
-        numbers = np.arange(ENVIRONMENTS)
+        numbers = np.arange(self.batch.environments)
         for tick in range(SPREAD_TICKS):
-            self.step(law())
+            self.step(np.array(jnp.tanh(output(policy, self.normalized()))))
             chosen = numbers % SPREAD_TICKS == tick
             self.seen = self.batch.start(chosen=chosen)
             self.ticks[chosen] = self.sums[chosen] = 0.0
             self.ended &= ~chosen
 
-    def statistics(self):
-        """Return figures of the episodes that ended since the last call."""
-        ended = np.concatenate(self.episodes)
-        self.episodes = []
-        names = ("success", "return", "duration_s")
-        figures = dict(zip(names, ended.mean(axis=0).round(4).tolist(), strict=True))
-        return {"episodes": len(ended)} | (figures if len(ended) else {})
+    def collect(self, trained, ticks, trace, key):
+        """Fly, and return the columns of ``loss`` by row: of all ticks of all environments."""
+        (policy, spread), critic = trained
+        rows = []
+        for _ in range(ticks):
+            z = self.normalized()
+            key, draw = jax.random.split(key)
+            u, density = act(policy, spread, z, draw)
+            done, started = self.step(np.tanh(np.asarray(u)))
+            reward = REWARD_SCALE * done.rewards[:, 0].astype(np.float32)
+            rows.append((z, u, density, reward, done.terminated[:, 0], self.ended, started))
+        z, u, density, *facts = (
+            np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)
+        )
+        z = np.concatenate([z, self.normalized()[None]])
+        reward, terminated, done, started = (x.astype(np.float32) for x in facts)
+        found = advantages(critic, trace, z, reward, terminated, done, started)
+        advantage, returns = (np.asarray(x) for x in found)
+        columns = (z[:-1], u, density, advantage, returns, 1.0 - started)
+        return tuple(x.reshape(-1, *x.shape[2:]) for x in columns)
+
+    def episodes_ended(self):
+        """Return success, return and duration (s) of the episodes (n, 3) that ended since the last
+        call.
+        """
+        ended, self.episodes = np.concatenate(self.episodes), []
+        return ended
+
+
+def statistics(ended):
+    """Return figures of episodes (n, 3)."""
+    names = ("success", "return", "duration_s")
+    figures = dict(zip(names, ended.mean(axis=0).round(4).tolist(), strict=True))
+    return {"episodes": len(ended)} | (figures if len(ended) else {})
+
+
+def batch_of(columns):
+    """Return the columns of ``loss`` with normalized advantages."""
+    z, u, density, advantage, returns, counts = columns
+    chosen = advantage[counts > 0.0]
+    advantage = (advantage - chosen.mean()) / (chosen.std() + 1e-6)
+    return tuple(map(jnp.asarray, (z, u, density, advantage, returns, counts)))
 
 
 def imitated(flights, policy, rng):
@@ -245,31 +281,6 @@ def imitated(flights, policy, rng):
     return policy
 
 
-def collect(flights, trained, ticks, trace, key):
-    """Fly, and return the columns of ``loss`` by row: of all ticks of all environments."""
-    (policy, spread), critic = trained
-    rows = []
-    for _ in range(ticks):
-        z = flights.normalized()
-        key, draw = jax.random.split(key)
-        u, density = act(policy, spread, z, draw)
-        done, started = flights.step(np.tanh(np.asarray(u)))
-        reward = REWARD_SCALE * done.rewards[:, 0].astype(np.float32)
-        rows.append((z, u, density, reward, done.terminated[:, 0], flights.ended, started))
-    z, u, density, *facts = (
-        np.stack([np.asarray(x) for x in column]) for column in zip(*rows, strict=True)
-    )
-    z = np.concatenate([z, flights.normalized()[None]])
-    reward, terminated, done, started = (x.astype(np.float32) for x in facts)
-    found = advantages(critic, trace, z, reward, terminated, done, started)
-    advantage, returns = (np.asarray(x) for x in found)
-    counts = 1.0 - started
-    chosen = advantage[counts > 0.0]
-    advantage = (advantage - chosen.mean()) / (chosen.std() + 1e-6)
-    columns = (z[:-1], u, density, advantage, returns, counts)
-    return tuple(jnp.asarray(x.reshape(-1, *x.shape[2:])) for x in columns)
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenario", type=Path, default=FOLDER / "docking.toml")
@@ -278,6 +289,7 @@ def main():
     parser.add_argument("--start", type=Path, help="begin with this policy instead of imitation")
     parser.add_argument("--batches", type=int, default=240)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask scheduler: its workers fly")
     options = parser.parse_args()
 
     if loaded(options.scenario).chaser.actuation != "ideal":
@@ -294,18 +306,23 @@ def main():
     moments = tuple((jax.tree.map(jnp.zeros_like, w),) * 2 for w in trained)
     number, rate = 1.0, RATES[0]
     key, curve = jax.random.key(options.seed), []
-    flights.spread_out(lambda: np.array(jnp.tanh(output(policy, flights.normalized()))))
+    facts, flown = facts_of(flights.batch.task), flights
+    if options.cluster is not None:
+        from fleet import Fleet
+
+        flown = Fleet(options.cluster, options.scenario, options.seed, flights)
+    flown.spread_out(policy)
     part = TICKS * ENVIRONMENTS
     key, draw = jax.random.split(key)
-    batch = collect(flights, trained, EPISODE_TICKS, 1.0, draw)
+    batch = batch_of(flown.collect(trained, EPISODE_TICKS, 1.0, draw))
     for k in range(VALUE_ROUNDS):  # a critic that knows nothing would lead the policy astray
         order = jnp.asarray(rng.integers(len(batch[0]), size=part))
         rates = (0.0, RATES[1] * (1.0 - k / VALUE_ROUNDS))
         trained, moments, number = improve(trained, moments, number, rates, order, batch)
-    flights.statistics()
+    flown.episodes_ended()
     for k in range(options.batches):
         key, draw = jax.random.split(key)
-        batch = collect(flights, trained, TICKS, TRACE, draw)
+        batch = batch_of(flown.collect(trained, TICKS, TRACE, draw))
         left = 1.0 - k / options.batches
         for _ in range(EPOCHS):
             order = jnp.asarray(rng.permutation(part))
@@ -315,7 +332,7 @@ def main():
         rate *= 1.5 if far < 0.5 * AIM else 1.0 / 1.5 if far > 2.0 * AIM else 1.0
         steps = (k + 1) * ENVIRONMENTS * TICKS
         curve.append({"steps": steps, "cpu_s": round(time.process_time() - begin_s, 1)})
-        curve[-1] |= flights.statistics()
+        curve[-1] |= statistics(flown.episodes_ended())
         noise = {
             "noise": round(float(np.exp(trained[0][1]).mean()), 4),
             "divergence": round(far, 4),
@@ -323,7 +340,6 @@ def main():
         }
         print(json.dumps(curve[-1] | noise), flush=True)
         if (k + 1) % KEPT == 0 or k + 1 == options.batches:
-            facts = facts_of(flights.batch.task)
             model = network(trained[0][0], flights.middle, flights.scale, facts)
             onnx.save(model, str(options.out))
             if options.curve is not None:

@@ -27,7 +27,7 @@ _COVERED_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class TargetSurface:
     """Faces of the target's cuboids that are not covered by others, and points on them, TRF.
 
     ``planes`` (F, 4): outward normal, and distance from the origin. ``points_m`` (P, 3). ``face``
@@ -40,7 +40,7 @@ class Surface:
     box: IntArray
 
 
-def surface_of(boxes: Sequence[Box], spacing_m: float) -> Surface:
+def surface_of(boxes: Sequence[Box], spacing_m: float) -> TargetSurface:
     """Return the surface of cuboids, with points in the middles of cells of at most ``spacing_m``
     by ``spacing_m``.
     """
@@ -62,7 +62,7 @@ def surface_of(boxes: Sequence[Box], spacing_m: float) -> Surface:
                     points.append(places)
                     boxes_of.append(number)
     face = np.repeat(np.arange(len(points)), [len(p) for p in points])
-    return Surface(np.array(planes), np.concatenate(points), face, np.array(boxes_of))
+    return TargetSurface(np.array(planes), np.concatenate(points), face, np.array(boxes_of))
 
 
 def _middles(half_m: float, spacing_m: float) -> Array:

@@ -42,7 +42,7 @@ from .stack import (
     stack_plant,
     stated_stack,
 )
-from .surface import Surface, extent_m, surface_of
+from .surface import TargetSurface, extent_m, surface_of
 
 PLANTS = 256
 """Bodies that are drawn from ``[truth]``; each episode flies one of them. The mean of a figure over
@@ -459,7 +459,7 @@ def _solids(scenario: Scenario) -> Array:
     return np.array(rows)
 
 
-_NO_SURFACE = Surface(np.zeros((1, 4)), np.zeros((1, 3)), *np.zeros((2, 1), dtype=np.int64))
+_NO_SURFACE = TargetSurface(np.zeros((1, 4)), np.zeros((1, 3)), *np.zeros((2, 1), dtype=np.int64))
 """Of other tasks, whose kernels do not read it: arrays need an address."""
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from chaserdock_agents.mapper.types import CameraUncertainty, ConstantRates, ImageTracks
 from chaserdock_models import rotations
@@ -75,3 +76,23 @@ class PointTarget:
                     rotation @ rotations.to_matrix(noise), tracks[i, seen][order],
                     px[seen][order], np.zeros(int(seen.sum())),
                 )  # fmt: skip
+
+
+Circle = tuple[Array, Array, float]
+"""Centre (3,), unit normal (3,) and radius, TRF."""
+
+
+def circle_points(circle: Circle) -> Array:
+    """Return points (60, 3) of a circle."""
+    centre, normal, radius = circle
+    turn = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    one, other = np.linalg.svd(normal[None])[2][1:]
+    return centre + radius * (np.cos(turn)[:, None] * one + np.sin(turn)[:, None] * other)
+
+
+def ellipse_row(px: Array) -> Array:
+    """Return the six numbers of the ellipse through pixels (n, 2), as in ``FeatureTracks``."""
+    (x, y), (w, h), degrees = cv2.fitEllipseDirect(px.astype(np.float32))
+    angle = np.deg2rad(degrees)
+    longer, shorter, angle = (w, h, angle) if w >= h else (h, w, angle + np.pi / 2.0)
+    return np.array([x, y, longer / 2.0, shorter / 2.0, angle % np.pi, 0.85])

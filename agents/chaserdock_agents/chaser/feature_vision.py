@@ -40,13 +40,16 @@ from numpy.typing import ArrayLike
 
 from .perception.features import (
     FeatureTracker,
+    ImageEllipses,
     KnownTarget,
     NoMapPose,
     PointDescriptions,
     SeenLandmarks,
     TrackedPoints,
     describe,
+    find_ellipses,
     pose_by_map,
+    region_around,
 )
 from .perception.refine import PoseInCamera
 from .sighting import BadImage, decode_image, pose_solution, without_sighting
@@ -54,6 +57,9 @@ from .vision import REMEMBERED_IMAGES, Vision
 
 _DESCRIBED_PERIOD_S = 5.2
 """Between images whose points are described: 64 bytes a point and second, of 45 in all."""
+_ELLIPSE_PERIOD_S = 2.6
+"""Between images in which ellipses are sought: 8 to 13 degrees of turn at 3 to 5 deg/s. With 5.2 s
+half of the rings of a flight are missed; every second costs 20 ms (docs/evidence/unknown.md)."""
 _MOST_MAPS = 100
 """Maps that may have arrived and not count yet: a minute of attempts at a first map."""
 
@@ -109,7 +115,7 @@ class FeatureVision(Vision):
         self._maps: deque[LandmarkMap] = deque(maxlen=_MOST_MAPS)
         self._counting: CountingMap | None = None
         self._first_id: int | None = None
-        self._described_s = 0.0
+        self._described_s = self._searched_s = 0.0
 
     def take(self, message: Odometry | LandmarkMap) -> None:
         """Take the chaser's own state, or a map."""
@@ -167,11 +173,15 @@ class FeatureVision(Vision):
             axes = rotations.to_matrix(pose[1])
             expected = PoseInCamera(axes.T @ (at[0] - pose[0]), axes.T @ turned[0])
             described = describe(pixels, self._camera, seen.ids, seen.px, expected)
+        ellipses = None
+        if known is not None and time_s - self._searched_s >= _ELLIPSE_PERIOD_S:
+            self._searched_s = time_s
+            ellipses = find_ellipses(pixels, self._camera, region_around(self._camera, seen.px))
         if self._first_id is None:
             # No point of an earlier process of this chaser has such an id.
             self._first_id = max(image.tick, 0) * self._tracker.tuning.most_points
         self.tracks = self._tracks(
-            image, "seen" if len(seen.ids) else "nothing", *pose, seen, described
+            image, "seen" if len(seen.ids) else "nothing", *pose, seen, described, ellipses
         )
         sighting = self._sighting_by(counting, image, seen, pose)
         return msgspec.structs.replace(sighting, map=self._sighted(counting))
@@ -274,6 +284,7 @@ class FeatureVision(Vision):
         q_w_irf_wxyz: Array,
         seen: TrackedPoints | None = None,
         described: PointDescriptions | None = None,
+        ellipses: ImageEllipses | None = None,
     ) -> FeatureTracks:
         head = FeatureTracks(
             tick=image.tick,
@@ -293,6 +304,7 @@ class FeatureVision(Vision):
             ages=tuple(np.rint(seen.ages_s / AGE_STEP_S).astype(np.int64).tolist()),
             described=() if described is None else tuple((described.ids + first).tolist()),
             descriptions=b"" if described is None else described.values.tobytes(),
+            ellipses=() if ellipses is None else tuple(ellipses.rows().ravel().tolist()),
         )
 
 

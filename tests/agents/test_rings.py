@@ -21,7 +21,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from numpy.typing import NDArray
-from unknown_cases import circle_points, ellipse_row
+from unknown_cases import circle_points, ellipse_row, foil, ring_image
 
 CAMERA = Camera.from_hfov(960, 540, np.deg2rad(60.0))
 WHOLE = (0, 0, 960, 540)
@@ -30,30 +30,11 @@ WHOLE = (0, 0, 960, 540)
 # -- ellipses in an image --------------------------------------------------------------------------
 
 
-def foil(seed: int = 3) -> NDArray[np.float64]:
-    """Return a crinkled grey image (540, 960)."""
-    rng = np.random.default_rng(seed)
-    grain = cv2.GaussianBlur(rng.normal(size=(540, 960)), (0, 0), 4.0)
-    return 110.0 + 18.0 * grain / grain.std()
-
-
-def drawn(background: NDArray[np.float64], grey: float = 30.0) -> NDArray[np.uint8]:
-    """Return an image with a ring, a third of which something hides."""
-    ring = np.zeros((1080, 1920), np.uint8)
-    cv2.ellipse(ring, ((960.0, 540.0), (240.0, 150.0), 30.0), 255, 16, cv2.LINE_AA)
-    share = cv2.resize(ring, (960, 540), interpolation=cv2.INTER_AREA) / 255.0
-    image = np.asarray(background * (1.0 - share) + grey * share, dtype=np.float64)
-    cv2.rectangle(image, (455, 295), (500, 360), 60.0, -1)
-    return np.clip(image + np.random.default_rng(1).normal(0.0, 1.0, image.shape), 0, 255).astype(
-        np.uint8
-    )
-
-
 @pytest.mark.parametrize("background", [foil(), np.full((540, 960), 80.0)], ids=["foil", "flat"])
 def test_both_edges_of_a_ring_that_is_hidden_in_part_are_found(
     background: NDArray[np.float64],
 ) -> None:
-    found = find_ellipses(drawn(background), CAMERA, WHOLE)
+    found = find_ellipses(ring_image(background), CAMERA, WHOLE)
     for longer, shorter in ((64.0, 41.5), (56.0, 33.5)):  # 8 px wide
         off = np.abs(found.axes_px - (longer, shorter)).max(axis=1)
         best = int(np.argmin(off))
@@ -61,7 +42,7 @@ def test_both_edges_of_a_ring_that_is_hidden_in_part_are_found(
         assert np.linalg.norm(found.centres_px[best] - (479.75, 269.75)) < 1.0
         assert abs(found.angles_rad[best] - np.deg2rad(30.0)) < 0.05
         assert 0.6 <= found.coverage[best] < 1.0
-    again = find_ellipses(drawn(background), CAMERA, WHOLE)
+    again = find_ellipses(ring_image(background), CAMERA, WHOLE)
     assert np.array_equal(found.rows(), again.rows())
 
 

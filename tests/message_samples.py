@@ -15,7 +15,7 @@ HEAD: dict[str, Any] = {"seq": 7, "tick": 12, "sim_time_ns": 800_000_000}
 SOLUTION = m.PoseSolution(position_m=V, q_wxyz=Q, covariance=EYE6, reprojection_rms_px=0.125)
 PORT = m.ChosenPort(
     chaser=1, number=2, position_m=V, axis=(0.6, 0.0, -0.8),
-    axis_sigma_rad=0.01, flatness_m=0.002, clearance_m=0.25,
+    axis_sigma_rad=0.01, flatness_m=0.002, clearance_m=0.25, radius_m=0.125,
 )  # fmt: skip
 MASS = m.MassEstimate(
     mass_kg=150.5,
@@ -59,6 +59,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         ages=(0, 3, 250),
         described=(12,),
         descriptions=bytes(range(128)),
+        ellipses=(480.5, 270.25, 50.0, 30.5, 0.75, 0.625),
     ),
     m.LandmarkMap(
         **HEAD,
@@ -258,7 +259,9 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.Health(**HEAD, process="chaser/0", rejected={"world/tick:format": 2}, lost=1, stale=0),
     m.RecorderAck(**HEAD),
     m.ThrusterFaultCommand(chaser=1, thruster=3, kind="weak", factor=0.5, operator="me"),
-    m.PortRequest(chaser=1, image=0, pixel=(512.5, 270.25), operator="me"),
+    m.PortRequest(
+        chaser=1, image=0, pixel=(512.5, 270.25), exposed_ns=7, radii_m=(0.1, 0.2), operator="me"
+    ),
     m.ArmingCommand(action="arm", operator="me"),
     m.ArmingReply(accepted=True, reason="armed by me"),
     m.Kill(**HEAD, by="a button"),

@@ -6,10 +6,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from chaserdock_agents.mapper.types import CameraUncertainty, ConstantRates, ImageTracks
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from numpy.typing import NDArray
 
 FOCAL_PX = 830.0
 LAB = CameraUncertainty(np.deg2rad(0.05), 0.0005, 0.0005, np.deg2rad(0.05), 0.0005)
@@ -75,3 +77,42 @@ class PointTarget:
                     rotation @ rotations.to_matrix(noise), tracks[i, seen][order],
                     px[seen][order], np.zeros(int(seen.sum())),
                 )  # fmt: skip
+
+
+Circle = tuple[Array, Array, float]
+"""Centre (3,), unit normal (3,) and radius, TRF."""
+
+
+def circle_points(circle: Circle) -> Array:
+    """Return points (60, 3) of a circle."""
+    centre, normal, radius = circle
+    turn = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    one, other = np.linalg.svd(normal[None])[2][1:]
+    return centre + radius * (np.cos(turn)[:, None] * one + np.sin(turn)[:, None] * other)
+
+
+def ellipse_row(px: Array) -> Array:
+    """Return the six numbers of the ellipse through pixels (n, 2), as in ``FeatureTracks``."""
+    (x, y), (w, h), degrees = cv2.fitEllipseDirect(px.astype(np.float32))
+    angle = np.deg2rad(degrees)
+    longer, shorter, angle = (w, h, angle) if w >= h else (h, w, angle + np.pi / 2.0)
+    return np.array([x, y, longer / 2.0, shorter / 2.0, angle % np.pi, 0.85])
+
+
+def foil(seed: int = 3) -> NDArray[np.float64]:
+    """Return a crinkled grey image (540, 960)."""
+    rng = np.random.default_rng(seed)
+    grain = cv2.GaussianBlur(rng.normal(size=(540, 960)), (0, 0), 4.0)
+    return 110.0 + 18.0 * grain / grain.std()
+
+
+def ring_image(background: NDArray[np.float64], grey: float = 30.0) -> NDArray[np.uint8]:
+    """Return an image with a ring, a third of which something hides."""
+    ring = np.zeros((1080, 1920), np.uint8)
+    cv2.ellipse(ring, ((960.0, 540.0), (240.0, 150.0), 30.0), 255, 16, cv2.LINE_AA)
+    share = cv2.resize(ring, (960, 540), interpolation=cv2.INTER_AREA) / 255.0
+    image = np.asarray(background * (1.0 - share) + grey * share, dtype=np.float64)
+    cv2.rectangle(image, (455, 295), (500, 360), 60.0, -1)
+    return np.clip(image + np.random.default_rng(1).normal(0.0, 1.0, image.shape), 0, 255).astype(
+        np.uint8
+    )

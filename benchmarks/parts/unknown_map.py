@@ -10,7 +10,8 @@ after half a turn and one. ``size``, ``direction``: of the rate's error; ``mount
 which the cameras' unknown mounting alone turns it. ``closed``: when the mapper says that a side has
 returned, and poses from then on. ``next``: poses over the next turn (with ``--quick``: over 8 s),
 each by the latest map before it, against the frame of the map; landmarks against the surface in the
-frame of the last map. NEES is of velocity and rate (6). Times are CPU times of this process.
+frame of the last map, and rings by it (`unknown_rings`). NEES is of velocity and rate (6). Times
+are CPU times of this process.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from chaserdock_models.satellites import satellite, satellite_names
 from chaserdock_world.sensors.errors import camera_errors
 from common import BenchmarkFailed, Figures, Group, KeptResults, Options, seeds_of
 
+from .unknown_rings import RingSearch
 from .unknown_scene import SUNS, TUMBLES, SceneCase, UnknownImages
 
 UPDATE_S = 6.0
@@ -83,6 +85,14 @@ class MapOutcome:
     landmark_median_m: float = math.nan
     landmark_p90_m: float = math.nan
     merges: float = math.nan
+    ellipses_mean_s: float = math.nan
+    rings_s: float = math.nan
+    rings: float = math.nan
+    rings_false: float = math.nan
+    ring_offset_m: float = math.nan
+    ring_angle_rad: float = math.nan
+    ring_radius_m: float = math.nan
+    ring_nees: float = math.nan
 
 
 def uncertainty(images: UnknownImages) -> CameraUncertainty:
@@ -110,6 +120,7 @@ def fly(case: SceneCase, folder: Path) -> MapOutcome:
     closed: TargetMap | None = None
     last: TargetMap | None = None
     next_s, image_s, mapper_s, points = 1.0, [], 0.0, 0.0
+    search = RingSearch(camera)
     times, motions = [], []
     for exposure in images.exposures():
         i, at_s, own = exposure.chaser, exposure.time_s, exposure.odometry
@@ -124,6 +135,7 @@ def fly(case: SceneCase, folder: Path) -> MapOutcome:
         rays = camera.normalized(seen.px)
         mapper.add(ImageTracks(i, at_s, lens, rotations.to_matrix(q), seen.ids, rays, seen.ages_s))
         last_motion = mapper.motion
+        search.look(exposure, lens, q, seen.px, last_motion)
         if last_motion is not None and round(at_s * 5) % DESCRIBED_IMAGES == 0:
             begin_s = time.process_time()
             p, r = last_motion.at([at_s])
@@ -175,6 +187,11 @@ def fly(case: SceneCase, folder: Path) -> MapOutcome:
             )
     errors = pose_errors(images, np.array(times), motions)
     distance = surface_distances(case.mesh, (last.landmarks_m - errors.origin_m) @ errors.turn)
+    assert last.motion is not None
+    outcome = replace(
+        outcome,
+        **search.figures(case.mesh, last.motion, errors.turn, errors.origin_m),
+    )
     return replace(
         outcome,
         first_s=first.time_s,

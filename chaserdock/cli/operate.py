@@ -52,6 +52,7 @@ class PortSearch(StrEnum):
     """What a port can be found by."""
 
     flat = "flat"
+    ring = "ring"
 
 
 class ThrusterFaultKind(StrEnum):
@@ -111,6 +112,10 @@ def command(
     find: Annotated[
         PortSearch | None, typer.Option(help="port: choose the best place of this kind")
     ] = None,
+    radii: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="MIN MAX", help="port --find ring: least and greatest radius, metres"),
+    ] = None,
     operator: OperatorOpt = "",
     before: Annotated[
         float | None,
@@ -160,6 +165,7 @@ def command(
             pixel=pixel,
             point_m=point,
             find=None if find is None else find.value,
+            radii_m=radii,
             operator=operator,
         )
         reply = send_port_request(link.link(timeout_s=timeout), request, timeout)
@@ -185,7 +191,7 @@ def command(
     _print_reply(reply, as_json)
 
 
-_PORT_OPTIONS = ("image", "pixel", "point", "find")
+_PORT_OPTIONS = ("image", "pixel", "point", "find", "radii")
 
 
 def _number_of(image: str) -> int:

@@ -73,7 +73,8 @@ def send_port_request(link: Link, request: PortRequest, timeout_s: float) -> Com
     """
     if not request.says_one_place:
         raise OperatorError(
-            "port: needs either --image and --pixel X Y, or --point X Y Z, or --find"
+            "port: needs either --image and --pixel X Y, or --point X Y Z, or --find, with --radii "
+            "MIN MAX for a ring only"
         )
     return _request(link, TO_CHOOSE_PORTS, "port", request, timeout_s, "mapper", CommandReply)
 

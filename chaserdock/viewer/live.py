@@ -23,7 +23,13 @@ from pathlib import Path
 import viser
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import CommandReply, JoinReply, JoinRequest, OperatorCommand
+from chaserdock_protocol.messages import (
+    CommandReply,
+    JoinReply,
+    JoinRequest,
+    OperatorCommand,
+    PortRequest,
+)
 from chaserdock_protocol.process import StopSignal, print_status
 from chaserdock_protocol.recording.log import LogError, read_log
 from chaserdock_protocol.scenario import flight_scenario_from_json
@@ -33,12 +39,20 @@ from chaserdock_protocol.transport.session import ignore_foreign_publishers
 
 from chaserdock.exit_codes import STOPPED
 from chaserdock.launch.mission_address import ADDRESS_FILE
-from chaserdock.launch.reach import TO_VIEW, check_rights
+from chaserdock.launch.reach import (
+    TO_CHOOSE_PORTS,
+    TO_COMMAND,
+    TO_VIEW,
+    Rights,
+    check_rights,
+)
 
 from .address import page_token, url_of
 from .history import History, Line, reply_text
 from .page import PERIOD_S, Page, ViewOptions
 from .player import show_flown
+from .port_dialog import NAME as CLICK
+from .port_dialog import ImageClicks, PortDialogs
 from .report_page import NAME, ReportPage
 from .server import page_server
 from .snapshot import EVENT_TOPICS, OF_CHASERS, MissionState
@@ -95,7 +109,9 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
             ).result()
 
         report, place = ReportPage(), f"/{token}/{NAME}"
-        with page_server(options.host, options.port, token, {NAME: report}) as server:
+        clicks = ImageClicks(token)
+        documents = {NAME: report, CLICK: clicks}
+        with page_server(options.host, options.port, token, documents) as server:
             print_status(
                 "viewer",
                 f"{url_of(options.host, server.get_port(), token)} shows the mission; Ctrl-C ends "
@@ -112,7 +128,7 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
                     if mission is None:
                         continue
                     run_id = mission.run_id
-                    _MissionView(patient, server, mission, options).run(ended)
+                    _MissionView(patient, server, mission, options, link, clicks).run(ended)
             if options.folder is not None and not stop():
                 closed = _Unwatched(server, stop) if watch_parent else stop
                 show_flown(server, options, report, place, closed)
@@ -224,7 +240,7 @@ class _Feed:
             feed.subscriptions += [node.subscribe_newest(topic, depth, i) for i in range(chasers)]
         feed.subscriptions += [
             node.subscribe_newest(topic, _STATES)
-            for topic in (topics.TARGET, topics.STACK, topics.SOLVER)
+            for topic in (topics.TARGET, topics.MAP, topics.STACK, topics.SOLVER)
         ]
         feed.subscriptions += [node.subscribe_newest(topic, _EVENTS) for topic in EVENT_TOPICS]
         return feed
@@ -259,8 +275,11 @@ class _MissionView:
         server: viser.ViserServer,
         mission: JoinReply,
         options: ViewOptions,
+        link: Link,
+        clicks: ImageClicks,
     ) -> None:
         self._open_node, self._mission, self._truth = connect, mission, options.truth
+        self._link = link
         self._folder = options.folder
         self._read_past_s = -math.inf
         scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
@@ -271,7 +290,7 @@ class _MissionView:
         self._paces: deque[tuple[float, float]] = deque(maxlen=50)
         self._received_s = time.monotonic()
         self._connect()
-        self._commands: queue.Queue[tuple[str, int] | None] = queue.Queue(maxsize=8)
+        self._commands: queue.Queue[Order | None] = queue.Queue(maxsize=8)
         self._page = Page(
             server,
             scenario,
@@ -279,6 +298,7 @@ class _MissionView:
             truth=options.truth,
             command=self._command,
             timeline=None,
+            ports=PortDialogs(clicks, self._choose_port),
         )
 
     def run(self, stop: Callable[[], bool]) -> None:
@@ -378,33 +398,55 @@ class _MissionView:
     # -- commands ----------------------------------------------------------------------------------
 
     def _command(self, what: str, chaser: int) -> None:
+        command = OperatorCommand(
+            command=what,  # type: ignore[arg-type]
+            chaser=chaser,
+            operator="viewer",
+        )
+        self._queue(Order(what, TO_COMMAND, "controller", command, self._page.show_reply))
+
+    def _choose_port(self, request: PortRequest, show: Callable[[str], None]) -> None:
+        self._queue(Order("port", TO_CHOOSE_PORTS, "mapper", request, show))
+
+    def _queue(self, order: Order) -> None:
         try:
-            self._commands.put_nowait((what, chaser))
+            self._commands.put_nowait(order)
         except queue.Full:
-            self._page.show_reply(
-                f"⚠ {what} chaser {chaser}: not sent, {self._commands.maxsize} commands are pending"
-            )
+            order.show(f"⚠ {order.name}: not sent, {self._commands.maxsize} commands are pending")
 
     def _operate(self) -> None:
-        while (item := self._commands.get()) is not None:
-            what, chaser = item
-            self._page.show_reply(f"{what} chaser {chaser}: sent")
-            command = OperatorCommand(
-                command=what,  # type: ignore[arg-type]
-                chaser=chaser,
-                operator="viewer",
-            )
-            try:
-                reply = self._node.query(
-                    topics.OPERATE_KEY, command, CommandReply, _REPLY_TIMEOUT_S
-                )
-            except ChaserdockError as error:
-                self._page.show_reply(f"⚠ {what} chaser {chaser}: {error}")
-                continue
-            if reply is None:
-                self._page.show_reply(
-                    f"⚠ {what} chaser {chaser}: no reply from the controller within "
-                    f"{_REPLY_TIMEOUT_S:g} s"
-                )
-            else:
-                self._page.show_reply(("✓ " if reply.accepted else "⚠ ") + reply_text(reply))
+        while (order := self._commands.get()) is not None:
+            order.show(f"{order.name}: sent")
+            order.show(outcome_of(order, self._link, self._node))
+
+
+@dataclass(frozen=True)
+class Order:
+    """A command of the page: what it is, the rights that it needs, who receives it, the message,
+    and the function that shows what became of it.
+    """
+
+    what: str
+    rights: Rights
+    receiver: str
+    message: OperatorCommand | PortRequest
+    show: Callable[[str], None]
+
+    @property
+    def name(self) -> str:
+        """What it is, and of which chaser."""
+        return f"{self.what} chaser {self.message.chaser}"
+
+
+def outcome_of(order: Order, link: Link, node: Node) -> str:
+    """Send an order and return what became of it."""
+    (key,) = order.rights.queries
+    try:
+        check_rights(link, order.what, order.rights)
+        reply = node.query(key, order.message, CommandReply, _REPLY_TIMEOUT_S)
+    except ChaserdockError as error:
+        return f"⚠ {order.name}: {error}"
+    if reply is None:
+        silence = f"no reply from the {order.receiver} within {_REPLY_TIMEOUT_S:g} s"
+        return f"⚠ {order.name}: {silence}"
+    return ("✓ " if reply.accepted else "⚠ ") + reply_text(reply)

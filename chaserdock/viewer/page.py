@@ -25,6 +25,7 @@ from . import text
 from .address import DEFAULT_HOST
 from .history import History
 from .plots import COLOURS, Plot, plots_of, points_of
+from .port_dialog import PortDialogs
 from .scene import VIEWS, SceneView
 from .snapshot import OLD_S, MissionState
 
@@ -119,7 +120,8 @@ SPEEDS = ("0.25", "0.5", "1", "2", "5", "10", "20")
 
 class Page:
     """The page of one mission, shared by all tabs. ``command``: called on viser's threads; None for
-    a page without buttons. ``report``: path of the report on the server, if there is one.
+    a page without buttons. ``ports``: dialogs to choose ports, of a target of unknown shape.
+    ``report``: path of the report on the server, if there is one.
     """
 
     def __init__(
@@ -132,8 +134,11 @@ class Page:
         command: SendCommand | None,
         timeline: Timeline | None,
         report: str | None = None,
+        ports: PortDialogs | None = None,
     ) -> None:
         self._server, self._scenario, self._report = server, scenario, report
+        self._ports = ports if scenario.maps_target else None
+        self._newest: tuple[Image | None, ...] = (None,) * len(scenario.chasers)
         self._timeline = timeline
         self._slider: Any = None
         self._drawn_s = -math.inf
@@ -192,12 +197,23 @@ class Page:
             def _(event: Any, chaser: int = i) -> None:
                 command(event.target.value, chaser)
 
+            if self._ports is not None:
+                self._port_button(self._ports, i)
             stop = gui.add_button(f"{ABORT} chaser {i}", color="red")
 
             @stop.on_click
             def _(event: Any, chaser: int = i) -> None:
                 # In the tab of the operator only.
                 _confirm_abort((event.client or self._server).gui, chaser, command)
+
+    def _port_button(self, ports: PortDialogs, chaser: int) -> None:
+        button = self._server.gui.add_button(f"port chaser {chaser}")
+
+        @button.on_click
+        def _(event: Any) -> None:
+            # In the tab of the operator only.
+            gui = (event.client or self._server).gui
+            ports.open(gui, self._scenario, chaser, lambda number: self._newest[number])
 
     def _time_line(self, line: Timeline) -> None:
         gui = self._server.gui
@@ -334,6 +350,7 @@ class Page:
         log that has been judged.
         """
         slow = time.monotonic() - self._drawn_s >= _SLOW_S
+        self._newest = tuple(chaser.image for chaser in state.chasers)
         with self._server.atomic():
             self._scene_view.draw(state, history, slow)
             if self._slider is not None:

@@ -30,7 +30,7 @@ class ReportPage:
         self._thread: threading.Thread | None = None
         self._made: tuple[HTTPStatus, str] | None = None
 
-    def __call__(self) -> tuple[HTTPStatus, str]:
+    def __call__(self, query: str = "") -> tuple[HTTPStatus, str]:
         """Return status and HTML. Does not wait: the caller serves the page's web socket, too."""
         if self.log is None:
             return HTTPStatus.NOT_FOUND, "<p>There is no log yet.</p>"

@@ -13,6 +13,7 @@ import trimesh
 import viser
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import LandmarkMap
 from chaserdock_protocol.scenario import FlightScenario, Scenario
 from chaserdock_world.orbit import earth_disc, to_sun
 from chaserdock_world.rendering.background import star_field
@@ -46,6 +47,10 @@ _REFERENCE_M, _REFERENCE_RAD = 0.02, math.radians(3.0)
 """Distance (m) and angle (rad) of a chaser from its reference from which the reference is drawn:
 nearer ones lie inside the body.
 """
+_LANDMARK_M = 0.008
+"""Size (m) of a landmark. Larger: they hide each other; smaller: they are not seen from 5 m."""
+_PORT_M = 0.15
+"""Length (m) of the axis of a chosen port, half a chaser."""
 _RING_RGB = (96, 104, 116)
 """Colour (0 to 255) of the rings: grey, darker than the faint lines of chasers. Brighter: they hide
 paths.
@@ -104,12 +109,17 @@ class SceneView:
         self._near = near / np.linalg.norm(near)
         self._add_scale()
 
-        self._target = self._body("/scene/target", shapes.mesh_of(target_body(scenario)))
+        body = target_body(scenario)
         self._estimate = scene.add_frame("/scene/estimate", axes_length=0.15, axes_radius=0.002)
-        size = scenario.target_model().size_m
-        self._lines(
-            "/scene/estimate/box", shapes.box_edges(size) * 1.02, _rgb(ESTIMATE_COLOUR), 2.0
-        )
+        if body.parts:
+            self._target = self._body("/scene/target", shapes.mesh_of(body))
+            size = scenario.target_model().size_m
+            self._lines(
+                "/scene/estimate/box", shapes.box_edges(size) * 1.02, _rgb(ESTIMATE_COLOUR), 2.0
+            )
+        else:  # of unknown shape, while it flies
+            self._target = scene.add_frame("/scene/target", show_axes=False)
+        self._map: LandmarkMap | None = None
 
         self._keep_out_m = scenario.limits.min_distance_target_m
         self._keep_out = self._lines(
@@ -262,6 +272,8 @@ class SceneView:
         keep_out_m = state.keep_out_m(self._scenario.limits.min_distance_target_m)
         if keep_out_m != self._keep_out_m:
             self._keep_out_m, self._keep_out.points = keep_out_m, shapes.sphere(keep_out_m)
+        if state.map is not None and state.map is not self._map:
+            self._draw_map(state.map)
         for i, chaser in enumerate(state.chasers):
             pose = state.chaser(i)
             self._place(self._chasers[i], pose)
@@ -281,6 +293,23 @@ class SceneView:
             if slow and estimate is not None:
                 trail = history.trails[i].between(state.time_s() - TRAIL_S, state.time_s())
                 self._trails[i].points = shapes.polyline(trail)
+
+    def _draw_map(self, known: LandmarkMap) -> None:
+        """Draw the landmarks of a map, and its ports with their axes."""
+        self._map = known
+        self._scene.add_point_cloud(
+            "/scene/estimate/landmarks",
+            np.reshape(known.landmarks_m, (-1, 3)).astype(np.float32),
+            _rgb(ESTIMATE_COLOUR),
+            point_size=_LANDMARK_M,
+            point_shape="circle",
+            precision="float32",
+        )
+        for port in known.ports:
+            at = np.array(port.position_m)
+            axis = shapes.polyline(np.stack([at, at + _PORT_M * np.array(port.axis)]))
+            colour = _rgb(COLOURS[port.chaser % len(COLOURS)])
+            self._lines(f"/scene/estimate/port_{port.chaser}", axis, colour, 4.0)
 
     def _fix_frame(self, target: Pose) -> None:
         if self.view == "the world":

@@ -23,8 +23,8 @@ from websockets.http11 import Request, Response
 from .address import ViewError, free_port, is_own_origin, path_below_token
 
 _RequestHandler = Callable[[ServerConnection, Request], Response | None]
-Documents = Mapping[str, Callable[[], tuple[http.HTTPStatus, str]]]
-"""Pages beside viser's by name: functions that return status and HTML at once."""
+Documents = Mapping[str, Callable[[str], tuple[http.HTTPStatus, str]]]
+"""Pages beside viser's by name: functions that return status and HTML of a query at once."""
 
 
 @contextlib.contextmanager
@@ -110,9 +110,9 @@ def request_check(
     def check(connection: ServerConnection, request: Request) -> Response | None:
         path = path_below_token(request.path, token)
         response = respond(connection, dataclasses.replace(request, path=path or request.path))
-        name = (path or "").partition("?")[0].removeprefix("/")
+        name, _, query = (path or "").removeprefix("/").partition("?")
         if response is not None and name in documents:
-            return _html(*documents[name]())
+            return _html(*documents[name](query))
         if response is None:
             origins = request.headers.get_all("Origin")
             if not is_own_origin(origins, request.headers.get_all("Host"), host):

@@ -20,6 +20,7 @@ from chaserdock_protocol.messages import (
     DrawnBody,
     DrawnTruth,
     Image,
+    LandmarkMap,
     MissionEnd,
     Odometry,
     PassiveSafety,
@@ -51,7 +52,7 @@ OF_CHASERS = (
 )
 EVENT_TOPICS = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
 """Topics of the list of events, and of its counts."""
-OF_ALL = (topics.TICK, topics.TARGET, topics.STACK, topics.SOLVER, topics.END)
+OF_ALL = (topics.TICK, topics.TARGET, topics.MAP, topics.STACK, topics.SOLVER, topics.END)
 """Topics of the state: of each chaser (OF_CHASERS), of the mission (OF_ALL). Within a tick their
 order is causal.
 """
@@ -173,6 +174,7 @@ class MissionState:
     target: TargetEstimate | None = None
     stack: StackEstimate | None = None
     solver: SolverStatus | None = None
+    map: LandmarkMap | None = None
     ended: MissionEnd | None = None
     truth: dict[str, BodyTruth | BodyReference] = field(default_factory=dict)
     true_body: DrawnBody | None = None
@@ -193,6 +195,8 @@ class MissionState:
                 self.stack = message
             case SolverStatus():
                 self.solver = message
+            case LandmarkMap():
+                self.map = message
             case MissionEnd():
                 self.ended = message
             case BodyTruth():

@@ -14,7 +14,7 @@ whose name begins with ``wall_``.
 from __future__ import annotations
 
 from functools import cache
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol
 
 import msgspec
 from chaserdock_models.arrays import Quaternion as Quaternion
@@ -437,7 +437,8 @@ class ChosenPort(Struct, frozen=True, kw_only=True):
 
     ``number``: of the choice, from 1; it stays while the place follows the map. ``axis_sigma_rad``:
     standard deviation of the normal. ``flatness_m``: RMS distance of its landmarks from their
-    plane. ``clearance_m``: room about the corridor in front of it, at most 10 m.
+    plane, or of the ring's edge from its circle. ``clearance_m``: room about the corridor in front
+    of it, at most 10 m. ``radius_m``: of the ring whose middle it is; None of a flat place.
     """
 
     chaser: ChaserId
@@ -447,6 +448,7 @@ class ChosenPort(Struct, frozen=True, kw_only=True):
     axis_sigma_rad: float
     flatness_m: float
     clearance_m: float
+    radius_m: float | None = None
 
 
 class SightedMap(Struct, frozen=True, kw_only=True):
@@ -487,6 +489,8 @@ DESCRIPTION_BYTES = 128
 """Size of the description of a point in ``FeatureTracks``."""
 MAX_TRACKS = 1000
 """Most points of an image, and most landmarks of a map."""
+MAX_ELLIPSES = 16
+"""Ellipses of an image, the best covered: a ring has four edges, and few satellites four rings."""
 TrackIds = Annotated[tuple[Count, ...], Meta(max_length=MAX_TRACKS)]
 
 
@@ -497,7 +501,10 @@ class FeatureTracks(Message, frozen=True, kw_only=True):
     and calibration. Of n points: ``ids``, ascending and never reused in a mission; ``places``, u
     and v of each, ideal pixels in steps of 1/64 px; ``ages``, for how long each was followed, in
     steps of 0.2 s. ``described`` (k,): ids of points with a description, in ``descriptions``, 128
-    bytes each; empty in most images. ``status``: of the image, as in ``Sighting``.
+    bytes each; empty in most images. ``ellipses``: six numbers of each ellipse of edges, which may
+    be the rim of a ring: u and v of its centre, half axes, the longer one first, ideal pixels,
+    angle from u to the longer axis, rad, and the share of its circumference that has an edge;
+    sought in few images. ``status``: of the image, as in ``Sighting``.
     """
 
     chaser: ChaserId
@@ -511,6 +518,7 @@ class FeatureTracks(Message, frozen=True, kw_only=True):
     ages: TrackIds = ()
     described: TrackIds = ()
     descriptions: Annotated[bytes, Meta(max_length=DESCRIPTION_BYTES * MAX_TRACKS)] = b""
+    ellipses: Annotated[tuple[float, ...], Meta(max_length=6 * MAX_ELLIPSES)] = ()
 
 
 MapStatus = Literal[
@@ -912,31 +920,64 @@ class OperatorCommand(Message, frozen=True, kw_only=True):
     expires_ns: Count | None = None
 
 
+PortSearch = Literal["flat", "ring"]
+"""What a port can be found by."""
+
+
 class PortRequest(Struct, frozen=True, kw_only=True):
     """Request to the mapper to judge a place on the target, and to make it the port of chaser
     ``chaser`` if it will do. Exactly one of ``pixel``, ``point_m`` and ``find`` says where.
 
-    ``pixel``: in the newest image of chaser ``image``, distorted as it is. ``point_m``: the place
-    of the surface nearest to this one, TRF. ``find``: ``flat`` takes the best place of all.
+    ``pixel``: in the newest image of chaser ``image``, or in that of the exposure ``exposed_ns``,
+    distorted as it is. ``point_m``: the place of the surface nearest to this one, TRF. ``find``:
+    ``flat`` takes the best flat place of all, ``ring`` the middle of the best ring, with a radius
+    in ``radii_m`` if that is stated.
     """
 
     chaser: ChaserId
     image: ChaserId | None = None
     pixel: tuple[float, float] | None = None
+    exposed_ns: Count | None = None
     point_m: Vector3 | None = None
-    find: Literal["flat"] | None = None
+    find: PortSearch | None = None
+    radii_m: tuple[float, float] | None = None
     operator: Text = ""
 
     @property
     def says_one_place(self) -> bool:
         """Whether it says where in exactly one way."""
-        return one_place(self.image, self.pixel, self.point_m, self.find)
+        exposed = self.exposed_ns is None or self.pixel is not None
+        return exposed and one_place(self)
 
 
-def one_place(image: object, pixel: object, point_m: object, find: object) -> bool:
-    """Return whether the parts of a ``PortRequest`` that are not None say one place."""
-    wanted = sum(part is not None for part in (pixel, point_m, find))
-    return wanted == 1 and (image is None) == (pixel is None)
+class PortPlace(Protocol):
+    """What of a request or of the timeline says where a port is to be."""
+
+    @property
+    def image(self) -> int | None: ...
+    @property
+    def pixel(self) -> tuple[float, float] | None: ...
+    @property
+    def point_m(self) -> tuple[float, float, float] | None: ...
+    @property
+    def find(self) -> PortSearch | None: ...
+    @property
+    def radii_m(self) -> tuple[float, float] | None: ...
+
+
+ONE_PLACE = "needs either image and pixel, or point_m, or find, with radii_m for a ring only"
+"""What `one_place` asks for."""
+
+
+def one_place(where: PortPlace) -> bool:
+    """Return whether a place is said in exactly one way."""
+    wanted = sum(part is not None for part in (where.pixel, where.point_m, where.find))
+    radii = where.radii_m
+    return (
+        wanted == 1
+        and (where.image is None) == (where.pixel is None)
+        and (radii is None or (where.find == "ring" and 0.0 <= radii[0] < radii[1]))
+    )
 
 
 class CommandReply(Message, frozen=True, kw_only=True):

@@ -10,8 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 from chaser_cases import deliver, lost, odometry, tick_of
+from chaserdock_agents.chaser.bodies_in_view import probe_discs
 from chaserdock_agents.chaser.core import ChaserCore
-from chaserdock_agents.chaser.feature_vision import FeatureVision, MappedPath, probe_discs
+from chaserdock_agents.chaser.feature_vision import FeatureVision, MappedPath
 from chaserdock_agents.chaser.perception.features import (
     MapPoseTuning,
     NoMapPose,

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from chaserdock_agents.mapper.docking_site import SiteLimits, judged_site, site_on_ray
 from chaserdock_agents.mapper.ports import MappedPoints, PortChooser, PortDecision
+from chaserdock_agents.mapper.rings import Ring
 from chaserdock_agents.mapper.surface import MappedSurface, SightLines, surface_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -333,3 +334,68 @@ def test_a_search_finds_flat_places_for_two_chasers() -> None:
         assert port.clearance_m > 0.0
     docked = [np.array(p.position_m) + 0.5 * np.array(p.axis) for p in (one, other)]
     assert np.linalg.norm(docked[0] - docked[1]) >= 0.4
+
+
+# -- rings -----------------------------------------------------------------------------------------
+
+ON_BUS = Ring(
+    np.array([0.33, -0.03, 0.02]), np.array([1.0, 0.0, 0.0]), 0.11, 0.002, 0.015, 0.6, 0.002, 0.9, 9
+)
+"""A ring that stands 3 cm before the side +X of the bus."""
+BEHIND_PANEL = replace(
+    ON_BUS, centre_m=np.array([0.0, 0.22, 0.0]), normal=np.array([0.0, 1.0, 0.0]), radius_m=0.08
+)
+INWARD = replace(ON_BUS, normal=-ON_BUS.normal, images=20)
+ROUGH = replace(ON_BUS, radius_m=0.09, normal_sigma_rad=0.06)
+
+
+def with_rings(*rings: Ring, turn: Array | None = None) -> PortChooser:
+    ports = PortChooser(flight_scenario(parse_scenario(PORTS, "ports")))
+    points = points_of(np.eye(3) if turn is None else turn, np.zeros(3))
+    vars(points)["rings"] = rings
+    ports.follow(points)
+    return ports
+
+
+def test_a_search_takes_the_best_ring_and_states_the_others() -> None:
+    other = replace(ON_BUS, radius_m=0.05, images=6)
+    ports = with_rings(INWARD, other, ROUGH, ON_BUS)
+    decision = ports.decide(0, PortChoice(find="ring"), None)
+    assert decision.accepted, decision.answer
+    assert decision.answer.startswith("ring of radius 0.110 m about (0.330, -0.030, 0.020) m")
+    assert (
+        "2 of 4 places will do, next: 0.330, -0.030, 0.020 m of radius 0.050 m" in decision.answer
+    )
+    (port,) = ports.ports()
+    assert (port.radius_m, port.axis, port.flatness_m) == (0.11, (1.0, 0.0, 0.0), 0.002)
+    assert port.position_m == (0.33, -0.03, 0.02)
+    narrow = ports.decide(0, PortChoice(find="ring", radii_m=(0.04, 0.06)), None)
+    assert narrow.answer.startswith("ring of radius 0.050 m")
+    assert ports.decide(1, PortChoice(find="flat"), None).accepted
+    assert ports.ports()[1].radius_m is None
+
+
+def test_a_ring_that_will_not_do_states_why() -> None:
+    ports = with_rings(BEHIND_PANEL, INWARD, ROUGH)
+    answer = ports.decide(0, PortChoice(find="ring"), None).answer
+    assert answer.startswith("none of 3 places will do; ring of radius 0.080 m about")
+    for reason in ("within the corridor", "it faces the middle", "normal known to 3.4 degrees"):
+        assert reason in answer
+    assert ports.decide(0, PortChoice(find="ring", radii_m=(0.2, 0.3)), None) == PortDecision(
+        False, "no ring of 0.2 to 0.3 m; radii of those found: 0.080, 0.110, 0.090 m"
+    )
+    assert ports.ports() == ()
+    none = with_rings().decide(0, PortChoice(find="ring"), None)
+    assert not none.accepted
+    assert none.answer.startswith("no ring: 0 ellipses in 0 images")
+
+
+def test_the_port_of_a_ring_moves_with_the_landmarks_about_it_and_keeps_its_normal() -> None:
+    ports = with_rings(ON_BUS)
+    assert ports.decide(0, PortChoice(find="ring"), None).accepted
+    shift = np.array([0.01, -0.02, 0.015])
+    ports.follow(points_of(np.eye(3), shift, seed=6))
+    (moved,) = ports.ports()
+    assert np.linalg.norm(moved.position_m - ON_BUS.centre_m - shift) < 0.002
+    assert moved.axis == (1.0, 0.0, 0.0)
+    assert moved.number == 1

@@ -4,19 +4,21 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import replace
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from chaserdock_agents.mapper.core import HELP, MapperCore, TrackCollector
+from chaserdock_agents.mapper.core import HELP, MapperCore, TrackCollector, pose_at
 from chaserdock_agents.mapper.frame import MapFrame
 from chaserdock_agents.mapper.mapper import MapperTuning, TargetMap
 from chaserdock_agents.mapper.ports import PortChooser, PortDecision
-from chaserdock_agents.mapper.types import ConstantRates
+from chaserdock_agents.mapper.types import ConstantRates, ImageTracks
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.camera import Camera
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
@@ -31,7 +33,7 @@ from chaserdock_protocol.messages import (
     Tick,
 )
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario, parse_scenario
-from unknown_cases import TRUE, PointTarget
+from unknown_cases import TRUE, Circle, PointTarget, circle_points, ellipse_row
 
 CASE: dict[str, Any] = {
     "name": "unknown",
@@ -113,6 +115,10 @@ def test_a_chaser_that_is_lost_owes_no_tracks() -> None:
         {"ids": (6, 5)},
         {"described": (5,)},
         {"described": (7,), "descriptions": bytes(128)},
+        {"ellipses": (1.0,) * 5},
+        {"ellipses": (400.0, 300.0, 20.0, 30.0, 0.5, 0.8)},
+        {"ellipses": (400.0, 300.0, 30.0, 0.0, 0.5, 0.8)},
+        {"ellipses": (400.0, 300.0, 30.0, 20.0, 0.5, 1.5)},
     ],
 )
 def test_tracks_whose_fields_do_not_fit_together_are_dropped(changes: dict[str, Any]) -> None:
@@ -144,10 +150,26 @@ def test_in_real_time_nothing_waits() -> None:
     assert collector.complete_tick == 0
 
 
+def circle_seen(circle: Circle, seen: ImageTracks, camera: Camera) -> Array:
+    """Return the row of the ellipse of a circle on the target in an image; empty from behind."""
+    at, turned = TRUE.at([seen.time_s])
+    place = turned[0].T @ (seen.position_w_m - at[0])
+    towards = place - circle[0]
+    if towards @ circle[1] < 0.3 * np.linalg.norm(towards):
+        return np.zeros(0)
+    inside = (circle_points(circle) - place) @ turned[0].T @ seen.rotation
+    return ellipse_row(camera.project_ideal(inside))
+
+
 def flown(
-    until_s: float, chasers: int = 2, core: MapperCore | None = None
+    until_s: float,
+    chasers: int = 2,
+    core: MapperCore | None = None,
+    circle: Circle | None = None,
 ) -> tuple[list[LandmarkMap], list[Event]]:
-    """Return maps and events from points on a sphere that two chasers see three times a second."""
+    """Return maps and events from points on a sphere that two chasers see three times a second.
+    ``circle``: on it, seen from its front.
+    """
     changed = {"chasers": CASE["chasers"][:chasers], "time": {"rate_hz": 15, "image_hz": 5}}
     core = core or MapperCore(scenario(**changed), instance="m1")
     camera = core.scenario.camera_model()
@@ -169,6 +191,9 @@ def flown(
                 np.rint(seen.ages_s[np.argsort(seen.ids)] / AGE_STEP_S).astype(int).tolist()
             ),
         )
+        if circle is not None:
+            row = circle_seen(circle, seen, core.scenario.camera_model())
+            message = msgspec.structs.replace(message, ellipses=tuple(row.tolist()))
         ticks = (tick_of(tick, tuple(range(chasers))),) if seen.chaser == 0 else ()
         images = msgspec.structs.replace(ticks[0], images=True) if ticks else None
         for received in (*((images,) if images else ()), message):
@@ -354,4 +379,34 @@ def test_a_port_waits_until_the_loop_has_closed(monkeypatch: pytest.MonkeyPatch)
     assert off @ towards > 1.0
     assert np.linalg.norm(off - (off @ towards) * towards) < 0.01
     two = PortRequest(chaser=0, image=1, pixel=pixel, find="flat")
-    assert core.choose(two)[0].reason.startswith("give image and pixel")
+    assert core.choose(two)[0].reason.startswith("needs either image and pixel")
+    with_radii = PortRequest(chaser=0, find="flat", radii_m=(0.1, 0.2))
+    assert core.choose(with_radii)[0].reason.startswith("needs either image and pixel")
+
+    # Of an image that the operator saw, not of the newest one.
+    earlier = core._images[1][-4]
+    seen_then = msgspec.structs.replace(request, exposed_ns=earlier.sim_time_ns)
+    core.choose(seen_then)
+    place, q = pose_at(newest, earlier.sim_time_ns)
+    expected = rotations.rotate_inverse(q, np.array(earlier.position_m) - place)
+    assert np.allclose(rays[-1][2][0], expected)
+    unknown = msgspec.structs.replace(request, exposed_ns=earlier.sim_time_ns + 1)
+    assert core.choose(unknown)[0].reason == "no image of chaser 1 at that time, or it is too old"
+
+
+@pytest.mark.slow(0.1)
+def test_a_ring_is_found_by_the_ellipses_of_all_chasers() -> None:
+    circle = (np.array([-0.45, -0.1, 0.05]), np.array([-0.96, -0.28, 0.0]), 0.12)
+    core = ClosedLater(scenario(approach={"dock_distance_m": 0.6}))
+    flown(20.0, core=core, circle=circle)
+    answer = core.choose(PortRequest(chaser=0, find="ring"))[0].reason
+    found = re.search(r"ring of radius (\S+) m about \(([^)]*)\) m", answer)
+    assert found is not None, answer
+    assert abs(float(found[1]) - 0.12) < 0.003
+    # Its place on the target, in whichever frame the map has.
+    centre = np.array([float(x) for x in found[2].split(",")])
+    assert core._map is not None
+    place, q = pose_at(core._map, core._map.sim_time_ns)
+    at, turned = TRUE.at([core._map.sim_time_ns / 1e9])
+    world = place + rotations.rotate(q, centre)
+    assert np.linalg.norm(world - at[0] - turned[0] @ circle[0]) < 0.02

@@ -252,6 +252,17 @@ _PORT = {"at_s": 9.0, "command": "port", "chasers": [0], "port": {"find": "flat"
         ([_PORT | {"port": {}}], {}, "needs either image and pixel, or point_m, or find"),
         ([_PORT | {"port": {"pixel": [1, 2]}}], {}, "needs either image and pixel"),
         ([_PORT | {"port": {"find": "flat", "point_m": [1, 0, 0]}}], {}, "needs either"),
+        (
+            [_PORT | {"port": {"find": "flat", "radii_m": [0.1, 0.2]}}],
+            {},
+            "for a ring only",
+        ),
+        (
+            [_PORT | {"port": {"find": "ring", "radii_m": [0.2, 0.1]}}],
+            {},
+            "for a ring only",
+        ),
+        ([_PORT | {"port": {"find": "ring", "radii_m": [0.1, 0.2]}}], {}, ""),
         ([{"at_s": 9.0, "command": "port", "chasers": [0]}], {}, "port goes with the command port"),
         ([{"at_s": 8.0, "command": "goto", "chasers": [0]}, _PORT], {}, "timeline.0: offset_m"),
         ([_PORT], {"perception": {"name": "default"}}, "timeline.0: ports are chosen on unknown"),

@@ -27,6 +27,7 @@ from chaserdock_protocol.messages import (
     DockingStatus,
     Event,
     Image,
+    LandmarkMap,
     MissionEnd,
     Odometry,
     Reference,
@@ -34,12 +35,13 @@ from chaserdock_protocol.messages import (
     Tick,
 )
 from chaserdock_protocol.recording.log import LogError
-from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.scenario import flight_scenario, load_scenario
 from chaserdock_protocol.transport import Link, Node
 from chaserdock_world.orbit import earth_disc
 from harness import ROOT, chaserdock, finished
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from message_samples import BY_TYPE
 from mission_keys import client, make_keys, router_with_rights
 from websockets.frames import Frame, Opcode
 
@@ -513,6 +515,27 @@ def test_the_first_view_shows_the_edge_of_the_earth(name: str) -> None:
     assert 0.1 < from_edge_rad < 0.4
     assert stars_m.min() > 5.0 * np.linalg.norm(camera.position)
     assert camera.far > 1.2 * max(stars_m.max(), earth_m.max())
+
+
+def test_a_target_of_unknown_shape_is_shown_by_its_landmarks_and_ports() -> None:
+    """In flight nobody knows its body."""
+    scenario = flight_scenario(load_scenario(ROOT / "scenarios" / "unknown-inspection.toml"))
+    known = BY_TYPE[LandmarkMap]
+    assert isinstance(known, LandmarkMap)
+    assert known.ports
+    state = MissionState.empty(2)
+    with page_server(DEFAULT_HOST, None, TOKEN) as server:
+        scene = SceneView(server, scenario)
+        scene.draw(state, History(2), slow=True)
+        assert server.scene.get_handle_by_name("/scene/estimate/landmarks") is None
+        state.update(topics.MAP, known)
+        scene.draw(state, History(2), slow=True)
+        landmarks = server.scene.get_handle_by_name("/scene/estimate/landmarks")
+        assert isinstance(landmarks, viser.PointCloudHandle)
+        assert np.allclose(landmarks.points, np.reshape(known.landmarks_m, (-1, 3)))
+        port = server.scene.get_handle_by_name("/scene/estimate/port_1")
+        assert isinstance(port, viser.LineSegmentsHandle)
+        assert np.allclose(port.points[0, 0], known.ports[0].position_m)
 
 
 def test_corridor_covers_the_allowed_region() -> None:

@@ -238,6 +238,7 @@ def test_every_quaternion_must_be_of_unit_length() -> None:
         (m.FeatureTracks, "places", [2**20 + 1, 0]),
         (m.FeatureTracks, "ages", [-1]),
         (m.FeatureTracks, "descriptions", bytes(128 * 1000 + 1)),
+        (m.FeatureTracks, "ellipses", [0.0] * (6 * 16 + 1)),
         (m.FeatureTracks, "status", "fine"),
         (m.LandmarkMap, "status", "fine"),
         (m.LandmarkMap, "landmarks_m", [0.0] * 3001),

@@ -298,6 +298,8 @@ class ChaserCore:
         self.fallback.end(command)
         if self.assurance is not None:
             self.assurance.add_estimate(known)
+        if known is not None:
+            self.vision.take(known)
         # Before the reply: in lock-step the next image follows it, and is to be seen with this
         # geometry.
         if (refused := self.vision.inform(command)) is not None:

@@ -16,8 +16,6 @@ import msgspec
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.camera import Camera
-from chaserdock_models.targets import Box
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.extrapolation import extrapolate
@@ -31,6 +29,7 @@ from chaserdock_protocol.messages import (
     Odometry,
     SightedMap,
     Sighting,
+    TargetEstimate,
     Tick,
 )
 from chaserdock_protocol.pose_image import UnusableImage
@@ -38,15 +37,19 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.topics import Topic
 from numpy.typing import ArrayLike
 
+from .bodies_in_view import Disc, chaser_discs, probe_discs
 from .perception.features import (
     FeatureTracker,
+    ImageEllipses,
     KnownTarget,
     NoMapPose,
     PointDescriptions,
     SeenLandmarks,
     TrackedPoints,
     describe,
+    find_ellipses,
     pose_by_map,
+    region_around,
 )
 from .perception.refine import PoseInCamera
 from .sighting import BadImage, decode_image, pose_solution, without_sighting
@@ -54,6 +57,12 @@ from .vision import REMEMBERED_IMAGES, Vision
 
 _DESCRIBED_PERIOD_S = 5.2
 """Between images whose points are described: 64 bytes a point and second, of 45 in all."""
+_ELLIPSE_PERIOD_S = 2.6
+"""Between images in which ellipses are sought: 8 to 13 degrees of turn at 3 to 5 deg/s. With 5.2 s
+half of the rings of a flight are missed; every second costs 20 ms (docs/evidence/unknown.md)."""
+_OLD_NS = 1_000_000_000
+"""Age from which an estimate does not tell where other chasers are: at 3 cm/s they move by half of
+the margin about them."""
 _MOST_MAPS = 100
 """Maps that may have arrived and not count yet: a minute of attempts at a first map."""
 
@@ -103,16 +112,21 @@ class FeatureVision(Vision):
         timing, self._errors = scenario.timing, scenario.navigation.errors()
         self._chaser, self._camera = chaser, scenario.camera_model()
         self._tracker = FeatureTracker(self._camera)
-        self._probe = probe_discs(self._camera, scenario.chaser.boxes()[1])
+        self._boxes = scenario.chaser.boxes()
+        self._probe = probe_discs(self._camera, self._boxes[1])
+        self._estimate: TargetEstimate | None = None
         self._latency_ticks = round(scenario.mapping.latency_s * timing.rate_hz)
         self._odometry: deque[Odometry] = deque(maxlen=REMEMBERED_IMAGES)
         self._maps: deque[LandmarkMap] = deque(maxlen=_MOST_MAPS)
         self._counting: CountingMap | None = None
         self._first_id: int | None = None
-        self._described_s = 0.0
+        self._described_s = self._searched_s = 0.0
 
-    def take(self, message: Odometry | LandmarkMap) -> None:
-        """Take the chaser's own state, or a map."""
+    def take(self, message: Odometry | LandmarkMap | TargetEstimate) -> None:
+        """Take the chaser's own state, a map, or an estimate that states where chasers are."""
+        if isinstance(message, TargetEstimate):
+            self._estimate = message
+            return
         known = self._odometry if isinstance(message, Odometry) else self._maps
         if not known or message.tick > known[-1].tick:
             known.append(message)  # pyright: ignore[reportArgumentType]
@@ -156,7 +170,8 @@ class FeatureVision(Vision):
         known = None if counting is None else counting.known
         try:
             pixels = decode_image(image)
-            seen = self._tracker.track(pixels, time_s, *pose, known, self._probe)
+            excluded = (*self._probe, *self._others(image.sim_time_ns))
+            seen = self._tracker.track(pixels, time_s, *pose, known, excluded)
         except (BadImage, UnusableImage) as error:
             self.tracks = self._tracks(image, "bad_image", *pose)
             return without_sighting(image, str(error), "bad_image")
@@ -167,14 +182,27 @@ class FeatureVision(Vision):
             axes = rotations.to_matrix(pose[1])
             expected = PoseInCamera(axes.T @ (at[0] - pose[0]), axes.T @ turned[0])
             described = describe(pixels, self._camera, seen.ids, seen.px, expected)
+        ellipses = None
+        if known is not None and time_s - self._searched_s >= _ELLIPSE_PERIOD_S:
+            self._searched_s = time_s
+            ellipses = find_ellipses(pixels, self._camera, region_around(self._camera, seen.px))
         if self._first_id is None:
             # No point of an earlier process of this chaser has such an id.
             self._first_id = max(image.tick, 0) * self._tracker.tuning.most_points
         self.tracks = self._tracks(
-            image, "seen" if len(seen.ids) else "nothing", *pose, seen, described
+            image, "seen" if len(seen.ids) else "nothing", *pose, seen, described, ellipses
         )
         sighting = self._sighting_by(counting, image, seen, pose)
         return msgspec.structs.replace(sighting, map=self._sighted(counting))
+
+    def _others(self, time_ns: int) -> tuple[Disc, ...]:
+        """Return the discs that cover other chasers in an image; none if nobody knows where they
+        are.
+        """
+        estimate = self._estimate
+        if estimate is None or time_ns - estimate.sim_time_ns > _OLD_NS:
+            return ()
+        return chaser_discs(self._camera, self._boxes, self._chaser, estimate)
 
     def _sighted(self, counting: CountingMap | None) -> SightedMap | None:
         """Return what the map that counts says to the controller."""
@@ -274,6 +302,7 @@ class FeatureVision(Vision):
         q_w_irf_wxyz: Array,
         seen: TrackedPoints | None = None,
         described: PointDescriptions | None = None,
+        ellipses: ImageEllipses | None = None,
     ) -> FeatureTracks:
         head = FeatureTracks(
             tick=image.tick,
@@ -293,31 +322,8 @@ class FeatureVision(Vision):
             ages=tuple(np.rint(seen.ages_s / AGE_STEP_S).astype(np.int64).tolist()),
             described=() if described is None else tuple((described.ids + first).tolist()),
             descriptions=b"" if described is None else described.values.tobytes(),
+            ellipses=() if ellipses is None else tuple(ellipses.rows().ravel().tolist()),
         )
-
-
-def probe_discs(camera: Camera, probe: Box) -> tuple[tuple[float, float, float], ...]:
-    """Return the discs (x, y, radius), px, that cover a chaser's own probe in its images.
-
-    ``probe``: cuboid along X of CRF.
-    """
-    length_m, *across_m = probe.size_m
-    along = np.arange(0.0, length_m + _DISC_STEP_M, _DISC_STEP_M) - length_m / 2.0
-    places = np.array(probe.position_m) + along[:, None] * np.array([1.0, 0.0, 0.0])
-    at = rotations.rotate_inverse(camera.q_crf_irf_wxyz, places - np.array(camera.position_crf_m))
-    seen = at[at[:, 2] > _NEAREST_M]
-    radii = camera.fx_px * (max(across_m) + _DISC_STEP_M) / seen[:, 2] / np.sqrt(2.0)
-    discs = np.column_stack([camera.project(seen), radii + _DISC_MARGIN_PX])
-    return tuple(
-        (float(x), float(y), float(r)) for x, y, r in discs[np.isfinite(discs).all(axis=1)]
-    )
-
-
-_DISC_STEP_M, _DISC_MARGIN_PX = 0.01, 12.0
-"""Distance of the discs along the probe, m, and what they reach beyond it: half a window of
-tracking."""
-_NEAREST_M = 0.02
-"""Depth beyond which the probe is drawn at all."""
 
 
 def _without_common(covariances_m2: Array) -> Array:

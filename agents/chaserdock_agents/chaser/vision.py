@@ -14,6 +14,7 @@ from chaserdock_protocol.messages import (
     LandmarkMap,
     Odometry,
     Sighting,
+    TargetEstimate,
     Tick,
     WrenchCommand,
 )
@@ -79,8 +80,8 @@ class Vision:
             self.sighting = without_sighting(image, self.failure)
         return self.sighting
 
-    def take(self, message: Odometry | LandmarkMap) -> None:
-        """Take the chaser's own state, or what is known of the target."""
+    def take(self, message: Odometry | LandmarkMap | TargetEstimate) -> None:
+        """Take the chaser's own state, or what is known of the target and of other chasers."""
 
     def missing(self, image: Image, tick: Tick | None, realtime: bool) -> Topic | None:
         """Return the topic of a message without which an image cannot be looked at yet, or None.

@@ -8,6 +8,7 @@ that nothing depends on the order of arrival.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -19,6 +20,7 @@ from chaserdock_protocol.messages import (
     AGE_STEP_S,
     DESCRIPTION_BYTES,
     MAX_COUNT,
+    ONE_PLACE,
     PX_STEP,
     CommandReply,
     Event,
@@ -37,6 +39,7 @@ from chaserdock_protocol.topics import Topic
 from .frame import MapFrame
 from .mapper import MAP_STATUS, Mapper, TargetMap
 from .ports import MappedPoints, PortChooser, PortDecision
+from .rings import circle_sights
 from .surface import SightLines
 from .types import CameraUncertainty, ImageTracks
 
@@ -54,10 +57,32 @@ HELP: dict[MapStatus, str] = {
 _AHEAD_TICKS = 8
 """Most ticks by which a chaser may know of a tick earlier than this process, as in the controller;
 messages that claim more are dropped."""
+_SEARCHED = 160
+"""Images of a chaser with ellipses that are kept: 400 s of one in 2.6 s, a turn at 1 deg/s."""
 _REMEMBERED = 256
 """Images of a chaser in which a place may be pointed at: 50 s of five a second."""
 OPEN = "the loop of the map is open: no side of the target has returned yet"
 """Why nothing flies near, nor chooses a place there."""
+
+
+@dataclass(frozen=True, eq=False)
+class _SearchedImage:
+    """Ellipses (k, 6) of an image, as in ``FeatureTracks``, and its camera's pose in WRF."""
+
+    time_ns: int
+    position_m: Array
+    q_wxyz: Array
+    ellipses: Array
+
+    def seen_by(self, message: LandmarkMap) -> tuple[Array, Array, Array]:
+        """Return optical centre (3,) and rotation (3, 3) in TRF of a map, and the ellipses."""
+        place, q = pose_at(message, self.time_ns)
+        to_trf = rotations.to_matrix(q).T
+        return (
+            to_trf @ (self.position_m - place),
+            to_trf @ rotations.to_matrix(self.q_wxyz),
+            self.ellipses,
+        )
 
 
 class TrackCollector:
@@ -167,6 +192,9 @@ class MapperCore:
         self._images: list[deque[FeatureTracks]] = [
             deque(maxlen=_REMEMBERED) for _ in scenario.chasers
         ]
+        self._searched: list[deque[_SearchedImage]] = [
+            deque(maxlen=_SEARCHED) for _ in scenario.chasers
+        ]
         self._timeline = [
             (entry.at_s, chaser, entry.port)
             for entry in sorted(scenario.timeline, key=lambda entry: entry.at_s)
@@ -227,7 +255,7 @@ class MapperCore:
         """
         newest = self._map
         if not request.says_one_place:
-            decision = PortDecision(False, "give image and pixel, or a point, or what to find")
+            decision = PortDecision(False, ONE_PLACE)
         elif newest is None:
             decision = PortDecision(False, f"no map of the target: {self._status or 'gathering'}")
         else:
@@ -264,7 +292,9 @@ class MapperCore:
             return self._ports.decide(chaser, where, None)
         image = self._image_for(where, newest)
         if image is None:
-            return PortDecision(False, f"no image of chaser {where.image} at that time")
+            return PortDecision(
+                False, f"no image of chaser {where.image} at that time, or it is too old"
+            )
         camera = self._camera
         x, y = camera.normalized(camera.undistort(np.array(where.pixel))).tolist()
         towards_w = rotations.rotate(image.q_wxyz, [x, y, 1.0])
@@ -278,14 +308,16 @@ class MapperCore:
     def _image_for(
         self, where: PortRequest | PortChoice, newest: LandmarkMap
     ) -> FeatureTracks | None:
-        """Return the image in which a pixel was pointed at: the newest one or, of the timeline, the
-        newest that the map has seen.
+        """Return the image in which a pixel was pointed at: that of the stated exposure, or the
+        newest one; of the timeline, the newest that the map has seen.
         """
         if where.image is None or where.image >= len(self._images):
             return None
-        of_timeline = isinstance(where, PortChoice)
         images = reversed(tuple(self._images[where.image]))
-        return next((i for i in images if not of_timeline or i.tick <= newest.tick), None)
+        if isinstance(where, PortChoice):
+            return next((i for i in images if i.tick <= newest.tick), None)
+        exposed_ns = where.exposed_ns
+        return next((i for i in images if exposed_ns in (None, i.sim_time_ns)), None)
 
     def _points(self, found: TargetMap, message: LandmarkMap) -> MappedPoints:
         """Return the landmarks of a map in its frame, and from where they were seen."""
@@ -304,7 +336,11 @@ class MapperCore:
             np.reshape(message.landmarks_m, (-1, 3)),
             self._frame.moments(found.covariances_m2),
             sights,
+            circle_sights(self._camera, [s.seen_by(message) for s in self._searched_images()]),
         )
+
+    def _searched_images(self) -> list[_SearchedImage]:
+        return [image for images in self._searched for image in images]
 
     # -- messages ----------------------------------------------------------------------------------
 
@@ -322,6 +358,15 @@ class MapperCore:
                 np.array(message.ages, dtype=float) * AGE_STEP_S,
             )
         )
+        if message.ellipses:
+            self._searched[message.chaser].append(
+                _SearchedImage(
+                    message.sim_time_ns,
+                    np.array(message.position_m),
+                    np.array(message.q_wxyz),
+                    np.reshape(message.ellipses, (-1, 6)),
+                )
+            )
         if message.described:
             values = np.frombuffer(message.descriptions, dtype=np.uint8)
             self.mapper.describe(
@@ -373,13 +418,24 @@ _MOST_KNOWN = 10_000
 
 def _is_whole(tracks: FeatureTracks) -> bool:
     """Return whether the fields of a message fit together."""
-    n = len(tracks.ids)
+    n, ellipses = len(tracks.ids), np.array(tracks.ellipses)
     return (
-        len(tracks.places) == 2 * n
+        len(ellipses) % 6 == 0
+        and _are_ellipses(ellipses.reshape(-1, 6))
+        and len(tracks.places) == 2 * n
         and len(tracks.ages) == n
         and all(a < b for a, b in zip(tracks.ids, tracks.ids[1:], strict=False))
         and len(tracks.descriptions) == DESCRIPTION_BYTES * len(tracks.described)
         and set(tracks.described) <= set(tracks.ids)
+    )
+
+
+def _are_ellipses(rows: Array) -> bool:
+    longer, shorter, coverage = rows[:, 2], rows[:, 3], rows[:, 5]
+    return bool(
+        np.isfinite(rows).all()
+        and ((longer >= shorter) & (shorter > 0.0)).all()
+        and ((coverage >= 0.0) & (coverage <= 1.0)).all()
     )
 
 

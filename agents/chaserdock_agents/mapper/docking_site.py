@@ -13,6 +13,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
+from .rings import Ring
 from .surface import MappedSurface, met_triangles
 
 _RADIUS_M = 0.12
@@ -49,7 +50,8 @@ class SiteLimits:
 class DockingSite:
     """A place to dock: its centre (3,), outward unit normal (3,), standard deviations along and of
     the normal, RMS distance of ``landmarks`` landmarks from their plane, and the least distance of
-    the surface from the axis of approach beyond what the chaser needs.
+    the surface from the axis of approach beyond what the chaser needs. Of the middle of a ``ring``
+    the plane is that of its edge, and ``landmarks`` is 0.
 
     ``why_not``: reasons against it; empty for a place that will do.
     """
@@ -62,6 +64,7 @@ class DockingSite:
     landmarks: int
     clearance_m: float
     why_not: tuple[str, ...]
+    ring: Ring | None = None
 
 
 def site_on_ray(
@@ -128,13 +131,7 @@ def judged_site(
             f"not flat: its landmarks are {flatness_m * 1e3:.0f} mm (RMS) from their plane, "
             f"at most {limits.flatness_m * 1e3:.0f} mm"
         )
-    if plane.normal_sigma_rad > limits.normal_rad:
-        why.append(
-            f"normal known to {math.degrees(plane.normal_sigma_rad):.1f} degrees, "
-            f"at most {math.degrees(limits.normal_rad):.1f}: see it from nearer or from aside"
-        )
-    if clear_m < 0.0:
-        why.append(f"the surface is {-clear_m * 1e3:.0f} mm within the corridor of approach")
+    why += _why_unreached(plane.normal_sigma_rad, clear_m, limits)
     return DockingSite(
         position,
         plane.normal,
@@ -147,9 +144,40 @@ def judged_site(
     )
 
 
-def landmarks_near(at_m: Array, landmarks_m: Array) -> NDArray[np.bool_]:
-    """Return which landmarks (n, 3) make the plane of a place (3,), (n,)."""
-    return np.linalg.norm(landmarks_m - at_m, axis=1) <= _RADIUS_M
+def ring_site(ring: Ring, surface: MappedSurface, limits: SiteLimits) -> DockingSite:
+    """Judge the middle of a ring as a place to dock."""
+    clear_m = _clearance(ring.centre_m, ring.normal, surface, limits)
+    return DockingSite(
+        ring.centre_m,
+        ring.normal,
+        ring.sigma_m,
+        ring.normal_sigma_rad,
+        ring.residual_m,
+        0,
+        clear_m,
+        tuple(_why_unreached(ring.normal_sigma_rad, clear_m, limits)),
+        ring,
+    )
+
+
+def _why_unreached(normal_sigma_rad: float, clear_m: float, limits: SiteLimits) -> list[str]:
+    """Return the reasons of the normal and of the room in front of a place against it."""
+    why = []
+    if normal_sigma_rad > limits.normal_rad:
+        why.append(
+            f"normal known to {math.degrees(normal_sigma_rad):.1f} degrees, "
+            f"at most {math.degrees(limits.normal_rad):.1f}: see it from nearer or from aside"
+        )
+    if clear_m < 0.0:
+        why.append(f"the surface is {-clear_m * 1e3:.0f} mm within the corridor of approach")
+    return why
+
+
+def landmarks_near(
+    at_m: Array, landmarks_m: Array, radius_m: float = _RADIUS_M
+) -> NDArray[np.bool_]:
+    """Return which landmarks (n, 3) are near a place (3,), (n,): those that make its plane."""
+    return np.linalg.norm(landmarks_m - at_m, axis=1) <= radius_m
 
 
 def plane_near(

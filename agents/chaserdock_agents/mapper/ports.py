@@ -10,13 +10,12 @@ import threading
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, Protocol
 
 import msgspec
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import ChosenPort
+from chaserdock_protocol.messages import ChosenPort, PortPlace
 from chaserdock_protocol.scenario import FlightScenario
 
 from .docking_site import (
@@ -25,8 +24,10 @@ from .docking_site import (
     judged_site,
     landmarks_near,
     plane_near,
+    ring_site,
     site_on_ray,
 )
+from .rings import CircleSights, Ring, RingTuning, find_rings
 from .surface import MappedSurface, SightLines, surface_of
 
 _CELL_M = 0.06
@@ -38,34 +39,36 @@ _MOST_CLEARANCE_M = 10.0
 _FULL_LANDMARKS = 20
 """Landmarks of a place beyond which more do not make it better: its normal is then known to a
 fifth of that of one landmark."""
+_FULL_IMAGES = 12
+"""Images that show a ring beyond which more do not make it better: half a turn of two chasers."""
+_AROUND_M = 0.06
+"""Landmarks up to so far outside a ring carry its port along, m: its edge has none itself."""
 _PROPOSALS = 3
 """Places that the answer to a search names."""
-
-
-class Where(Protocol):
-    """What of a request or of the timeline says where a port is to be."""
-
-    @property
-    def point_m(self) -> tuple[float, float, float] | None: ...
-    @property
-    def find(self) -> Literal["flat"] | None: ...
 
 
 @dataclass(frozen=True, eq=False)
 class MappedPoints:
     """Landmarks of a map: ``keys`` (n,), ascending, places (n, 3) with covariances (n, 3, 3), and
-    lines of sight to them. The surface is made when it is asked for.
+    lines of sight to them; the ellipses that cameras saw. Surface and rings are made when they are
+    asked for.
     """
 
     keys: IntArray
     landmarks_m: Array
     covariances_m2: Array
     sights: SightLines
+    circles: CircleSights = field(default_factory=CircleSights.none)
 
     @cached_property
     def surface(self) -> MappedSurface | None:
         """The surface; None of too few landmarks."""
         return surface_of(self.landmarks_m, self.covariances_m2, self.sights)
+
+    @cached_property
+    def rings(self) -> tuple[Ring, ...]:
+        """The circles that several images confirm."""
+        return find_rings(self.circles)
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,9 @@ class PortChooser:
         with self._lock:
             return tuple(held.port for _, held in sorted(self._held.items()))
 
-    def decide(self, chaser: int, where: Where, ray: tuple[Array, Array] | None) -> PortDecision:
+    def decide(
+        self, chaser: int, where: PortPlace, ray: tuple[Array, Array] | None
+    ) -> PortDecision:
         """Judge a place by the last map; make it the chaser's port if nothing is against it.
 
         ``ray``: origin and direction (3,) of a line of sight, for a request by a pixel.
@@ -119,8 +124,11 @@ class PortChooser:
             surface = None if points is None else points.surface
             if points is None or surface is None:
                 return PortDecision(False, "there is no surface: the map has too few landmarks")
-            if where.find is not None:
-                return self._found(chaser, points, surface)
+            if where.find == "flat":
+                judged = self._judged(_candidates(surface), points, surface)
+                return self._best(chaser, judged, points)
+            if where.find == "ring":
+                return self._ring(chaser, where.radii_m, points, surface)
             if ray is not None:
                 site = self._on_ray(ray, points, surface)
             else:
@@ -161,30 +169,53 @@ class PortChooser:
         known = surface, points.landmarks_m, points.covariances_m2, self._limits
         return [judged_site(middles[k], normals[k], *known, bool(surface.seen[k])) for k in faces]
 
-    def _found(self, chaser: int, points: MappedPoints, surface: MappedSurface) -> PortDecision:
-        """Return the decision for the best place of a search over the surface."""
-        judged = self._judged(_candidates(surface), points, surface)
+    def _ring(
+        self,
+        chaser: int,
+        radii_m: tuple[float, float] | None,
+        points: MappedPoints,
+        surface: MappedSurface,
+    ) -> PortDecision:
+        """Return the decision for the middle of the best ring, or why there is none."""
+        sights, tuning = points.circles, RingTuning()
+        if not points.rings:
+            return PortDecision(
+                False,
+                f"no ring: {len(sights.image)} ellipses in {sights.images} images, none of them "
+                f"the same circle in at least {tuning.least_images}; see it from nearer, or for "
+                "longer",
+            )
+        low, high = radii_m or tuning.radii_m
+        chosen = [r for r in points.rings if low <= r.radius_m <= high]
+        if not chosen:
+            known = ", ".join(f"{r.radius_m:.3f}" for r in points.rings)
+            return PortDecision(
+                False, f"no ring of {low:g} to {high:g} m; radii of those found: {known} m"
+            )
+        judged = [ring_site(r, surface, self._limits) for r in chosen]
+        return self._best(chaser, judged, points)
+
+    def _best(self, chaser: int, judged: list[DockingSite], points: MappedPoints) -> PortDecision:
+        """Return the decision for the best place of a search; of rings, why none will do."""
         good = [s for s in judged if not self._why_not(chaser, s)]
         if not good:
-            return PortDecision(False, f"none of {len(judged)} places will do")
+            reasons = "".join(
+                f"; {_figures(s)}: {', '.join(self._why_not(chaser, s))}"
+                for s in judged[:_PROPOSALS]
+                if s.ring is not None
+            )
+            return PortDecision(False, f"none of {len(judged)} places will do{reasons}")
         best = sorted(good, key=lambda s: -score(s, self._limits))[:_PROPOSALS]
         decision = self._decided(chaser, best[0], points)
         others = "; ".join(
-            f"{_text(s.position_m)} m, score {score(s, self._limits):.2f}" for s in best[1:]
+            f"{_text(s.position_m)} m{_radius(s)}, score {score(s, self._limits):.2f}"
+            for s in best[1:]
         )
         of = f"; {len(good)} of {len(judged)} places will do"
         return replace(decision, answer=decision.answer + of + (f", next: {others}" * bool(others)))
 
     def _decided(self, chaser: int, site: DockingSite, points: MappedPoints) -> PortDecision:
-        figures = (
-            f"({_text(site.position_m)}) m, normal ({_text(site.normal)}) within "
-            f"{math.degrees(min(site.normal_sigma_rad, math.pi)):.2g} degrees, "
-            f"{site.landmarks} landmarks"
-        )
-        if math.isfinite(site.flatness_m):
-            figures += f" {site.flatness_m * 1e3:.1f} mm (RMS) from their plane"
-        room_m = min(site.clearance_m, _MOST_CLEARANCE_M)
-        figures += f", {room_m:.2f} m of room beside the corridor"
+        figures = _figures(site)
         if why := self._why_not(chaser, site):
             return PortDecision(False, f"{'; '.join(why)}: {figures}")
         self._chosen += 1
@@ -195,7 +226,8 @@ class PortChooser:
             axis=vector(site.normal),
             axis_sigma_rad=site.normal_sigma_rad,
             flatness_m=site.flatness_m,
-            clearance_m=room_m,
+            clearance_m=_room_m(site),
+            radius_m=None if site.ring is None else site.ring.radius_m,
         )
         self._held[chaser] = _anchored(port, points)
         return PortDecision(True, f"{figures}, score {score(site, self._limits):.2f}")
@@ -240,18 +272,56 @@ def site_limits(scenario: FlightScenario) -> SiteLimits:
 def score(site: DockingSite, limits: SiteLimits) -> float:
     """Return how good a place is, 0 to 1: the product of what is left of the limits of flatness and
     normal, of the room beside the corridor and of the number of landmarks, as shares, and of the
-    cosine between its normal and the direction away from the middle of the target.
+    cosine between its normal and the direction away from the middle of the target. Of a ring it is
+    the share of its edge that is seen, what is left of the limit of its residual, and the number of
+    images instead of flatness and landmarks.
     """
     at = site.position_m
     outward = float(at @ site.normal) / max(float(np.linalg.norm(at)), 1e-9)
+    ring = site.ring
     shares = (
-        1.0 - site.flatness_m / limits.flatness_m,
         1.0 - site.normal_sigma_rad / limits.normal_rad,
         min(1.0, site.clearance_m / limits.radius_m),
-        min(1.0, site.landmarks / _FULL_LANDMARKS),
         outward,
     )
+    if ring is None:
+        shares += (
+            1.0 - site.flatness_m / limits.flatness_m,
+            min(1.0, site.landmarks / _FULL_LANDMARKS),
+        )
+    else:
+        shares += (
+            1.0 - ring.residual_px / RingTuning().support_px,
+            ring.coverage,
+            min(1.0, ring.images / _FULL_IMAGES),
+        )
     return float(np.prod([max(0.0, s) for s in shares]))
+
+
+def _figures(site: DockingSite) -> str:
+    """Return what an operator is told of a place."""
+    figures = (
+        f"({_text(site.position_m)}) m, normal ({_text(site.normal)}) within "
+        f"{math.degrees(min(site.normal_sigma_rad, math.pi)):.2g} degrees, "
+    )
+    if site.ring is None:
+        figures += f"{site.landmarks} landmarks"
+        if math.isfinite(site.flatness_m):
+            figures += f" {site.flatness_m * 1e3:.1f} mm (RMS) from their plane"
+    else:
+        figures = (
+            f"ring{_radius(site)} about {figures}{site.ring.images} images, "
+            f"{site.ring.residual_px:.1f} px (RMS), {100.0 * site.ring.coverage:.0f} % of its edge"
+        )
+    return f"{figures}, {_room_m(site):.2f} m of room beside the corridor"
+
+
+def _room_m(site: DockingSite) -> float:
+    return min(site.clearance_m, _MOST_CLEARANCE_M)
+
+
+def _radius(site: DockingSite) -> str:
+    return "" if site.ring is None else f" of radius {site.ring.radius_m:.3f} m"
 
 
 def _middles(surface: MappedSurface) -> Array:
@@ -266,21 +336,24 @@ def _candidates(surface: MappedSurface) -> list[int]:
 
 
 def _anchored(port: ChosenPort, points: MappedPoints) -> _Held:
-    near = landmarks_near(np.array(port.position_m), points.landmarks_m)
+    around_m = {} if port.radius_m is None else {"radius_m": port.radius_m + _AROUND_M}
+    near = landmarks_near(np.array(port.position_m), points.landmarks_m, **around_m)
     return _Held(port, points.keys[near], points.landmarks_m[near])
 
 
 def _moved(held: _Held, points: MappedPoints) -> _Held:
     """Return a port in a new map: moved by the median of the landmarks near it, then into the plane
     of those that are near it now if that is as well known as the plane before. Once a chaser is
-    near, it sees few of them, of which a plane turns by degrees.
+    near, it sees few of them, of which a plane turns by degrees. A ring keeps its normal.
     """
     port = held.port
     _, before, now = np.intersect1d(held.keys, points.keys, assume_unique=True, return_indices=True)
     at, axis = np.array(port.position_m), np.array(port.axis)
     if len(now) >= _ANCHORS:
         at = at + np.median(points.landmarks_m[now] - held.landmarks_m[before], axis=0)
-    found = plane_near(at, axis, points.landmarks_m, points.covariances_m2)
+    found = None
+    if port.radius_m is None:
+        found = plane_near(at, axis, points.landmarks_m, points.covariances_m2)
     if found is not None and found[0].normal_sigma_rad <= port.axis_sigma_rad:
         plane, near, _ = found
         at = at - float(plane.distances(at[None])[0]) * plane.normal

@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from chaserdock_protocol.messages import one_place
+from chaserdock_protocol.messages import ONE_PLACE, PortSearch, one_place
 
 from .fields import Index, NotNegative, Positive, Section, Vector
 
@@ -59,12 +59,17 @@ class PortChoice(Section):
     point_m: Vector | None = Field(
         default=None, description="The place of the surface nearest to this one (TRF), m."
     )
-    find: Literal["flat"] | None = Field(
-        default=None, description="`flat`: the best of all flat places with a free corridor."
+    find: PortSearch | None = Field(
+        default=None,
+        description="`flat`: the best of all flat places with a free corridor; `ring`: the middle "
+        "of the best ring.",
+    )
+    radii_m: tuple[NotNegative, Positive] | None = Field(
+        default=None, description="`ring`: least and greatest radius, m; without it, any."
     )
 
     @model_validator(mode="after")
     def _check_one(self) -> PortChoice:
-        if not one_place(self.image, self.pixel, self.point_m, self.find):
-            raise ValueError("needs either image and pixel, or point_m, or find")
+        if not one_place(self):
+            raise ValueError(ONE_PLACE)
         return self

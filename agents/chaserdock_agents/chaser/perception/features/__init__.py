@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 from .description import PointDescriptions, describe
+from .ellipses import EllipseTuning, ImageEllipses, find_ellipses, region_around
 from .memory import KnownTarget, SupposedMotion
 from .pose import MapPoseTuning, NoMapPose, SeenLandmarks, pose_by_map
 from .tracker import BYTES_PER_POINT, FeatureTracker, TrackedPoints, TrackingTuning
 
 __all__ = [
     "BYTES_PER_POINT",
+    "EllipseTuning",
     "FeatureTracker",
+    "ImageEllipses",
     "KnownTarget",
     "MapPoseTuning",
     "NoMapPose",
@@ -20,5 +23,7 @@ __all__ = [
     "TrackedPoints",
     "TrackingTuning",
     "describe",
+    "find_ellipses",
     "pose_by_map",
+    "region_around",
 ]

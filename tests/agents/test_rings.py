@@ -178,6 +178,15 @@ def test_ellipses_that_several_views_do_not_confirm_are_no_ring() -> None:
     assert find_rings(circle_sights(CAMERA, near), tuning) == ()
 
 
+def test_the_edges_of_one_ring_are_one_place() -> None:
+    centre, normal, radius = RINGS[0]
+    edges = ((centre, normal, radius), (centre + 0.01 * normal, normal, radius - 0.012))
+    rings = find_rings(views(1, circles=edges))
+    assert len(rings) == 1
+    assert np.linalg.norm(rings[0].centre_m - centre) < 0.015
+    assert len(find_rings(views(1, circles=edges), RingTuning(edge_m=0.0))) > 1
+
+
 def test_rings_outside_the_limits_are_left_out() -> None:
     assert len(find_rings(views(0), RingTuning(radii_m=(0.1, 0.3)))) == 1
     assert find_rings(views(0), RingTuning(radii_m=(0.3, 0.6))) == ()

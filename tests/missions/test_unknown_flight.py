@@ -6,11 +6,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
+from chaserdock_agents.chaser import feature_vision
+from chaserdock_models import rotations
+from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
+    PX_STEP,
+    BodyTruth,
     CommandReply,
     Event,
     FeatureTracks,
@@ -25,6 +31,7 @@ from chaserdock_protocol.messages import (
 )
 from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.recording.log import LogError, read_log
+from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.transport import Node
 from source_tree import ROOT
 
@@ -170,6 +177,60 @@ def test_the_mapper_answers_an_operator_who_chooses_a_port(tmp_path: Path) -> No
     assert reply.reason.startswith("the loop of the map is open")
     logged = [m for m in messages(asked) if isinstance(m, Event) and m.process == "mapper"]
     assert logged[-1].what == "port of chaser 0: refused"
+
+
+CROSSING = (
+    "duration_s=22.0",
+    "settling_s=20.0",
+    "chasers=[{position_m=[-2.0, 0.0, 0.0], look_at='target'}, "
+    "{position_m=[-1.0, -1.732, 0.0], look_at='target'}, "
+    "{position_m=[-1.0, 0.4, 0.2], look_at='target'}]",
+    "timeline=[{at_s=10.0, command='goto', chasers=[2], offset_m=[-1.0, -0.5, 0.2]}]",
+    "success={}",
+)
+"""Chaser 2 flies between chaser 0 and the target."""
+
+
+def points_on_another(flight: SimulatedFlight, seen_by: int, other: int) -> tuple[int, int]:
+    """Return how many points in a chaser's images from 12 s on are on another chaser, by its true
+    pose, and in how many images it is among the points.
+    """
+    scenario = load_scenario(PATH)
+    camera = scenario.camera_model()
+    truth = {(m.body, m.tick): m for m in messages(flight) if isinstance(m, BodyTruth)}
+    on_it = images = 0
+    for m in messages(flight):
+        if not isinstance(m, FeatureTracks) or m.chaser != seen_by or m.sim_time_ns < 12e9:
+            continue
+        own, body = truth[f"chaser/{seen_by}", m.tick], truth[f"chaser/{other}", m.tick]
+        lens, q = camera.irf_pose_in_world(own.position_m, own.q_wxyz)
+        corners = np.concatenate(
+            [cuboid_corners(b.size_m) + b.position_m for b in scenario.chaser.boxes()]
+        )
+        world = np.array(body.position_m) + rotations.rotate(body.q_wxyz, corners)
+        outline = camera.project(rotations.rotate_inverse(q, world - lens)).astype(np.float32)
+        hull = cv2.convexHull(outline)
+        points = np.reshape(m.places, (-1, 2)) * PX_STEP
+        inside = [cv2.pointPolygonTest(hull, (float(x), float(y)), False) >= 0 for x, y in points]
+        on_it += sum(inside)
+        low, high = points.min(axis=0), points.max(axis=0)
+        images += bool(((outline > low) & (outline < high)).all(axis=1).any())
+    return on_it, images
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("left_out", [True, False])
+def test_another_chaser_before_the_target_is_no_part_of_it(
+    left_out: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not left_out:
+        monkeypatch.setattr(feature_vision, "chaser_discs", lambda *_: ())
+    crossed = simulate(PATH, tmp_path / "run", CROSSING)
+    assert not crossed.crashes
+    on_it, images = points_on_another(crossed, 0, 2)
+    print(f"{on_it} points on chaser 2, which is among those of the target in {images} images")
+    assert images > 20
+    assert on_it == 0 if left_out else on_it > 100
 
 
 @pytest.mark.slow

@@ -43,6 +43,9 @@ class RingTuning:
     least_spread_rad: float = 0.35
     """Least angle between two of the directions from which it is seen: a shadow, or the corner of
     a box, looks round from one side."""
+    edge_m: float = 0.02
+    """Circles whose centres and radii differ by less are edges of one ring: 5 px at 2 m, beside
+    which an ellipse of one edge passes for the other."""
     most_pairs: int = 2000
     """Pairs that are tried, those whose lines of sight are nearest: bounds time and memory."""
     steps: int = 8
@@ -157,7 +160,9 @@ def _across(normal: Array) -> Array:
 
 
 def find_rings(sights: CircleSights, tuning: RingTuning | None = None) -> tuple[Ring, ...]:
-    """Return the circles that several views confirm, those of most images first."""
+    """Return the circles that several views confirm, those seen most first, one of each ring's
+    edges.
+    """
     tuning = tuning or RingTuning()
     if len(np.unique(sights.image)) < tuning.least_images:
         return ()
@@ -167,7 +172,7 @@ def find_rings(sights: CircleSights, tuning: RingTuning | None = None) -> tuple[
     off_px = np.zeros((len(candidates), len(free)))
     for k, circle in enumerate(candidates):
         off_px[k] = _rms(_deviations(sights, directions, circle)[0])
-    rings = []
+    rings: list[Ring] = []
     while len(candidates):
         fits = (off_px < tuning.support_px) & free
         images = np.array([len(np.unique(sights.image[row])) for row in fits])
@@ -178,7 +183,21 @@ def find_rings(sights: CircleSights, tuning: RingTuning | None = None) -> tuple[
         if found is not None:
             rings.append(found)
         free &= ~(support | fits[best])
-    return tuple(rings)
+    rings.sort(key=lambda r: -r.images * r.coverage)
+    kept: list[Ring] = []
+    for ring in rings:
+        if not any(_is_edge_of(ring, k, tuning) for k in kept):
+            kept.append(ring)
+    return tuple(kept)
+
+
+def _is_edge_of(circle: Ring, ring: Ring, tuning: RingTuning) -> bool:
+    """Return whether a circle is another edge of a ring, or a mixture of its edges."""
+    return (
+        float(np.linalg.norm(circle.centre_m - ring.centre_m)) < tuning.edge_m
+        and abs(circle.radius_m - ring.radius_m) < tuning.edge_m
+        and float(circle.normal @ ring.normal) > math.cos(tuning.normal_rad)
+    )
 
 
 def _candidates(sights: CircleSights, tuning: RingTuning) -> list[_Circle]:

@@ -35,7 +35,7 @@ _WIDTH_PX = 800
 """Width of the image in a dialog. Larger: a slower page; smaller: places are harder to hit."""
 _STYLE = "width:100%;cursor:crosshair;display:block;margin-bottom:0.4em"
 _MARK_RGB = (255, 176, 0)
-"""Colour of the mark at the place: amber, which no satellite has."""
+"""Colour (0 to 255) of the mark: that of warnings, which stands out from grey images."""
 _ASK = "Click the place where it is to dock, or let one be found."
 _NO_IMAGE = "There is no image of this chaser yet."
 SendPortRequest = Callable[[PortRequest, Callable[[str], None]], None]

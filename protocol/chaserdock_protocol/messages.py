@@ -920,7 +920,7 @@ class OperatorCommand(Message, frozen=True, kw_only=True):
     expires_ns: Count | None = None
 
 
-PortSearch = Literal["flat", "ring"]
+PortKind = Literal["flat", "ring"]
 """What a port can be found by."""
 
 
@@ -939,7 +939,7 @@ class PortRequest(Struct, frozen=True, kw_only=True):
     pixel: tuple[float, float] | None = None
     exposed_ns: Count | None = None
     point_m: Vector3 | None = None
-    find: PortSearch | None = None
+    find: PortKind | None = None
     radii_m: tuple[float, float] | None = None
     operator: Text = ""
 
@@ -960,7 +960,7 @@ class PortPlace(Protocol):
     @property
     def point_m(self) -> tuple[float, float, float] | None: ...
     @property
-    def find(self) -> PortSearch | None: ...
+    def find(self) -> PortKind | None: ...
     @property
     def radii_m(self) -> tuple[float, float] | None: ...
 

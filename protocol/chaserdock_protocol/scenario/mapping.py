@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from chaserdock_protocol.messages import ONE_PLACE, PortSearch, one_place
+from chaserdock_protocol.messages import ONE_PLACE, PortKind, one_place
 
 from .fields import Index, NotNegative, Positive, Section, Vector
 
@@ -59,7 +59,7 @@ class PortChoice(Section):
     point_m: Vector | None = Field(
         default=None, description="The place of the surface nearest to this one (TRF), m."
     )
-    find: PortSearch | None = Field(
+    find: PortKind | None = Field(
         default=None,
         description="`flat`: the best of all flat places with a free corridor; `ring`: the middle "
         "of the best ring.",

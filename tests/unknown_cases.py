@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,19 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
+UNKNOWN: dict[str, Any] = {
+    "name": "unknown",
+    "duration_s": 60.0,
+    "time": {"rate_hz": 15, "image_hz": 5},
+    "perception": {"name": "features"},
+    "target": {"model": "geo_servicer"},
+    "camera": {"width_px": 960, "height_px": 540},
+    "chasers": [
+        {"position_m": [-1.9, 0.1, 0.2], "look_at": "target"},
+        {"position_m": [-0.8, -1.7, -0.1], "look_at": "target"},
+    ],
+}
+"""Two chasers beside a satellite that nobody described."""
 FOCAL_PX = 830.0
 LAB = CameraUncertainty(np.deg2rad(0.05), 0.0005, 0.0005, np.deg2rad(0.05), 0.0005)
 TRUE = ConstantRates(

@@ -20,20 +20,9 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Image, RelativeEstimate, TargetEstimate
 from chaserdock_protocol.scenario import flight_scenario, parse_scenario
 from message_samples import EYE6, EYE12
+from unknown_cases import UNKNOWN
 
-CASE: dict[str, Any] = {
-    "name": "unknown",
-    "duration_s": 60.0,
-    "time": {"rate_hz": 15, "image_hz": 5},
-    "perception": {"name": "features"},
-    "target": {"model": "geo_servicer"},
-    "camera": {"width_px": 960, "height_px": 540},
-    "chasers": [
-        {"position_m": [-1.9, 0.1, 0.2], "look_at": "target"},
-        {"position_m": [-0.8, -1.7, -0.1], "look_at": "target"},
-    ],
-}
-PARSED = parse_scenario(CASE, "unknown")
+PARSED = parse_scenario(UNKNOWN, "unknown")
 SCENARIO = flight_scenario(PARSED)
 CAMERA, BOXES = SCENARIO.camera_model(), SCENARIO.chaser.boxes()
 

@@ -9,7 +9,6 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +19,7 @@ from chaserdock_protocol.messages import CommandReply, Image, OperatorCommand, P
 from chaserdock_protocol.scenario import flight_scenario, parse_scenario
 from chaserdock_protocol.transport import Node
 from mission_keys import PATIENCE_S, client, make_keys, router_with_rights
-from unknown_cases import foil, ring_image
+from unknown_cases import UNKNOWN, foil, ring_image
 
 from chaserdock.launch.reach import TO_CHOOSE_PORTS, TO_COMMAND
 from chaserdock.viewer.address import DEFAULT_HOST
@@ -32,19 +31,7 @@ from chaserdock.viewer.server import page_server
 from chaserdock.viewer.snapshot import MissionState
 
 TOKEN = "0123456789abcdefghijkl"
-CASE: dict[str, Any] = {
-    "name": "unknown",
-    "duration_s": 60.0,
-    "time": {"rate_hz": 15, "image_hz": 5},
-    "perception": {"name": "features"},
-    "target": {"model": "geo_servicer"},
-    "camera": {"width_px": 960, "height_px": 540},
-    "chasers": [
-        {"position_m": [-1.9, 0.1, 0.2], "look_at": "target"},
-        {"position_m": [-0.8, -1.7, -0.1], "look_at": "target"},
-    ],
-}
-SCENARIO = flight_scenario(parse_scenario(CASE, "unknown"))
+SCENARIO = flight_scenario(parse_scenario(UNKNOWN, "unknown"))
 EXPOSED_NS = 1_200_000_000
 needs_browser = pytest.mark.skipif(bool(why_no_browser()), reason=why_no_browser())
 

@@ -192,26 +192,31 @@ def _grown(
     start: _Ellipse, points: Array, normals: Array, tuning: EllipseTuning
 ) -> tuple[float, ...] | None:
     """Return an ellipse by all edges near it, with its coverage; None if they do not confirm it."""
-    ellipse: _Ellipse | None = start
-    for width in (2.0 * tuning.near_px, tuning.near_px):
-        assert ellipse is not None
-        distance, across, anomaly = _offsets(ellipse, points)
-        near = np.abs(distance) < width
-        near[near] = np.abs((across[near] * normals[near]).sum(axis=1)) > tuning.across
-        if _coverage(anomaly[near], tuning) < 0.5 * tuning.coverage:
+    ellipse = start
+    for width_px in (2.0 * tuning.near_px, tuning.near_px):
+        near, _, coverage = _near(ellipse, points, normals, width_px, tuning)
+        if coverage < 0.5 * tuning.coverage:
             return None
-        ellipse = _fitted(points[near], tuning)
-        if ellipse is None:
+        fitted = _fitted(points[near], tuning)
+        if fitted is None:
             return None
-    distance, across, anomaly = _offsets(ellipse, points)
-    near = np.abs(distance) < tuning.near_px
-    near[near] = np.abs((across[near] * normals[near]).sum(axis=1)) > tuning.across
-    coverage = _coverage(anomaly[near], tuning)
+        ellipse = fitted
+    near, distance, coverage = _near(ellipse, points, normals, tuning.near_px, tuning)
     if coverage < tuning.coverage:
         return None
     if float(np.sqrt(np.mean(distance[near] ** 2))) > tuning.residual_px:
         return None
     return (*ellipse, coverage)
+
+
+def _near(
+    ellipse: _Ellipse, points: Array, normals: Array, width_px: float, tuning: EllipseTuning
+) -> tuple[NDArray[np.bool_], Array, float]:
+    """Return which edges (k,) run along an ellipse, their distances (k,) and its coverage."""
+    distance, across, anomaly = _offsets(ellipse, points)
+    near = np.abs(distance) < width_px
+    near[near] = np.abs((across[near] * normals[near]).sum(axis=1)) > tuning.across
+    return near, distance, _coverage(anomaly[near], tuning)
 
 
 def _explains(ellipse: tuple[float, ...], arc: Array, tuning: EllipseTuning) -> bool:

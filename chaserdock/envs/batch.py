@@ -20,11 +20,11 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.plant import PrincipalFrame
 from numpy.typing import NDArray
 
-from .images import BatchImages
 from .native import LIBRARY, function
 from .task import TASKS, TrainingTask, task_of
 
 if TYPE_CHECKING:
+    from .images import BatchImages
     from .reference import ReferenceFlight
 
 Floats = NDArray[np.float32]
@@ -98,11 +98,14 @@ class DockingBatch:
         self._arrays = a
         self._state = _State(*(location(a[field[0]]) for field in _State._fields_))
         self._step, self._start = function("step_batch"), function("start_batch")
-        images = self.task.learning.observation == "images"
-        self._images = BatchImages(scenario, environments) if images else None
+        # Imported where they are needed: they load the world's renderer, and the NMPC.
+        self._images: BatchImages | None = None
+        if self.task.learning.observation == "images":
+            from .images import BatchImages
+
+            self._images = BatchImages(scenario, environments)
         self._reference: ReferenceFlight | None = None
         if self.task.learning.action == "reference":
-            # Imported here, as it needs the NMPC, which other actions do not load.
             from .reference import ReferenceFlight
 
             self._reference = ReferenceFlight(

@@ -15,12 +15,12 @@ from collections import OrderedDict
 from collections.abc import Callable
 from html import escape
 from http import HTTPStatus
-from typing import Any
+from typing import Any, get_args
 from urllib.parse import parse_qs
 
 import cv2
 import numpy as np
-from chaserdock_protocol.messages import Image, PortRequest
+from chaserdock_protocol.messages import Image, PortKind, PortRequest
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import NDArray
@@ -140,7 +140,7 @@ class _PortDialog:
             self._reply = gui.add_markdown(_ASK)
             self._from = gui.add_dropdown("image of", names, initial_value=names[chaser])
             self._shown = gui.add_html("")
-            find = gui.add_button_group("find", ("flat", "ring"))
+            find = gui.add_button_group("find", get_args(PortKind))
             again = gui.add_button("newest image")
             close = gui.add_button("close", color="gray")
         self._show()

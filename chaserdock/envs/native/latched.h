@@ -17,36 +17,33 @@ static void fix_to_target(const Task *t, Batch *b, int64_t chaser, const Motion 
     for (int i = 0; i < 4; i++) b->docked[(3 + i) * t->pitch + chaser] = q[i];
 }
 
-/* Move a docked chaser with its target. */
-static void carry(const Task *t, Batch *b, int64_t chaser, const Motion *target) {
-    double fixed[DOCKED_ROWS], place[3], turning[3], q[4], w[3];
-    for (int i = 0; i < DOCKED_ROWS; i++) fixed[i] = b->docked[i * t->pitch + chaser];
-    q_rotate(target->q, fixed, place);
-    cross3(target->w, fixed, turning);
-    q_rotate(target->q, turning, turning);
-    q_multiply(target->q, fixed + 3, q);
-    q_rotate_inverse(fixed + 3, target->w, w);
-    double *rows = b->bodies + chaser;
-    for (int i = 0; i < 3; i++) {
-        rows[(POSITION + i) * t->pitch] = target->x[i] + place[i];
-        rows[(VELOCITY + i) * t->pitch] = target->v[i] + turning[i];
-        rows[(RATE + i) * t->pitch] = w[i];
-    }
-    for (int i = 0; i < 4; i++) rows[(ATTITUDE + i) * t->pitch] = q[i];
-}
-
-/* Motion of a chaser that is latched at its goal. */
-static inline void latched_motion(const Place *place, const Motion *target, Motion *out) {
+/* Motion of a frame that is fixed to its target, at a place (3) and with an attitude (4) in TRF. */
+static inline void fixed_motion(const double *place, const double *turn, const Motion *target,
+                                Motion *out) {
     double arm[3], turning[3];
-    q_rotate(target->q, place->goal_m, arm);
-    cross3(target->w, place->goal_m, turning);
+    q_rotate(target->q, place, arm);
+    cross3(target->w, place, turning);
     q_rotate(target->q, turning, turning);
     for (int i = 0; i < 3; i++) {
         out->x[i] = target->x[i] + arm[i];
         out->v[i] = target->v[i] + turning[i];
     }
-    q_multiply(target->q, place->goal_wxyz, out->q);
-    q_rotate_inverse(place->goal_wxyz, target->w, out->w);
+    q_multiply(target->q, turn, out->q);
+    q_rotate_inverse(turn, target->w, out->w);
+}
+
+/* Move a docked chaser with its target. */
+static void carry(const Task *t, Batch *b, int64_t chaser, const Motion *target) {
+    double fixed[DOCKED_ROWS], *rows = b->bodies + chaser;
+    Motion m;
+    for (int i = 0; i < DOCKED_ROWS; i++) fixed[i] = b->docked[i * t->pitch + chaser];
+    fixed_motion(fixed, fixed + 3, target, &m);
+    for (int i = 0; i < 3; i++) {
+        rows[(POSITION + i) * t->pitch] = m.x[i];
+        rows[(VELOCITY + i) * t->pitch] = m.v[i];
+        rows[(RATE + i) * t->pitch] = m.w[i];
+    }
+    for (int i = 0; i < 4; i++) rows[(ATTITUDE + i) * t->pitch] = m.q[i];
 }
 
 /* Speed of a stack's centre of mass (WRF), and its angular rate. */

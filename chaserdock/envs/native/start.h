@@ -45,7 +45,7 @@ static void start(const Task *t, Batch *b, int64_t e) {
         spread3(random, t->spread_m_s, m.v);
         for (int i = 0; i < 3; i++) m.v[i] += place->start_velocity_m_s[i];
         spread3(random, t->spread_rad_s, m.w);
-        if (t->task == DETUMBLE) latched_motion(place, &target, &m);
+        if (t->task == DETUMBLE) fixed_motion(place->goal_m, place->goal_wxyz, &target, &m);
         place_body(&m, body, pitch, b->bodies + chaser);
         if (t->task == DETUMBLE) fix_to_target(t, b, chaser, &target);
         for (int i = 0; i < 6 && t->task != DETUMBLE; i++)
